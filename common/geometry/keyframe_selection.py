@@ -76,9 +76,13 @@ class KeyframeSelector:
         self._before_last, self._last = self._last, T_map_camera
         return Selection(True, reason)
 
-    def withdraw(self) -> None:
-        """Undo the last selection: no depth could be computed for that image, so it is no keyframe."""
-        self._last = self._before_last
+    def withdraw(self, T_map_camera: np.ndarray) -> None:
+        """Undo the selection of the image taken at this pose: it has no depth, so it is no keyframe.
+
+        No effect if another image was selected since: then that one takes its place.
+        """
+        if self._last is not None and np.array_equal(self._last, T_map_camera):
+            self._last = self._before_last
 
     def _trigger(self, T_map_camera: np.ndarray) -> str | None:
         if self._last is None:

@@ -99,18 +99,26 @@ class DepthNode(Node):
         self.detail = f"{self.overtaken} images overtaken"
 
     def _estimate_waiting(self) -> Outputs:
-        """Process the newest image whose pose is known; older images are dropped and counted as overtaken."""
+        """Process the newest image whose pose is known; older images are dropped and counted as overtaken.
+
+        A source that does not look at the image takes milliseconds: it processes the older images too.
+        """
         image = None
         assert self._history is not None  # images are queued after the calibration only
-        assert self._undistort is not None
         while self._waiting:
             if self._needs_beams and self._waiting[0].stamp_ns > self._history.newest_pose_ns:
                 break
-            if image is not None:
+            if image is not None and self.config.source in IGNORES_IMAGE:
+                yield from self._estimate(image)
+            elif image is not None:
                 self._count_overtaken()
             image = self._waiting.popleft()
-        if image is None:
-            return
+        if image is not None:
+            yield from self._estimate(image)
+
+    def _estimate(self, image: Image) -> Outputs:
+        assert self._history is not None  # images are queued after the calibration only
+        assert self._undistort is not None
         try:
             rgb = self._decode_image(image, self._undistort)
         except (UserError, ValueError) as error:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,8 +14,14 @@ from beamsplat.common.geometry.depth_sigma import BETWEEN_KEYFRAMES, OF_KEYFRAME
 from beamsplat.services.fusion import upsample
 from beamsplat.services.fusion.aggregation import Aggregation
 from beamsplat.services.fusion.input_checks import ImageCheck, check_beams
-from beamsplat.services.fusion.inputs import FusionInput, PlaneSweepConfig, SweepResult
-from beamsplat.services.fusion.keyframe_depth import WarpedDepth
+from beamsplat.services.fusion.inputs import (
+    FusionInput,
+    KeyframeTask,
+    PlaneSweepConfig,
+    SweepResult,
+    WorkingImage,
+)
+from beamsplat.services.fusion.keyframe_depth import KeyframeDepths, WarpedDepth
 from beamsplat.services.fusion.pairs import largest_cluster
 from beamsplat.services.fusion.plane_sweep import PlaneSweep
 from beamsplat.services.fusion.result import FusionResult, rejected
@@ -37,6 +44,27 @@ _LEARNED_FLOOR, _LEARNED_BEAM = 0.05, 0.10  # spread below which the learned agg
 _CONTRADICTION = 0.25  # log depth: a beam that differs by more contradicts the warped depth
 _LEAST_KNOWN = 20  # beams with warped depth, below which they are not compared
 _LEAST_INLIERS = 0.3  # share of the beams that fit the result, below which it is rejected
+
+
+@dataclass(frozen=True)
+class ExaminedImage:
+    """An image that passed the checks, with its beams and the depth of past keyframes in its view."""
+
+    frame: FusionInput
+    working: WorkingImage
+    uv: np.ndarray  # float64 [N, 2] pixels of the beams
+    z_m: np.ndarray  # float64 [N] their optical z
+    warped: WarpedDepth
+    depths: KeyframeDepths  # from which `warped` was computed
+    views: list[WorkingImage]  # source images of its sweep; empty if it is no keyframe
+
+
+@dataclass(frozen=True)
+class SweptKeyframe:
+    """The depth of a keyframe, and what it changes for later images."""
+
+    task: KeyframeTask
+    result: FusionResult
 
 
 class Fusion:
@@ -62,7 +90,21 @@ class Fusion:
         """Return the metric depth of one image, or a result without depth whose status is the reason.
 
         A keyframe needs several times more computation than another image; its depth is warped into later
-        images.
+        images. A caller that must not wait for it uses `examine`, `begin_keyframe` and `finish_keyframe`.
+        """
+        examined = self.examine(frame, keyframe=keyframe)
+        if isinstance(examined, FusionResult):
+            return examined
+        if keyframe:
+            return self.finish_keyframe(self.begin_keyframe(examined)())
+        return self.between_keyframes(examined)
+
+    def examine(self, frame: FusionInput, *, keyframe: bool) -> ExaminedImage | FusionResult:
+        """Check an image and its beams, and store it for later plane sweeps; call it in order of the stamps.
+
+        Returns:
+            The image, prepared for `begin_keyframe` or `between_keyframes`; or a result without depth, whose
+            status is the reason.
         """
         shape = self._sweep.camera.shape
         status = self._image_check.check(frame.image_rgb, frame.T_map_body)
@@ -74,20 +116,40 @@ class Fusion:
         status = check_beams(len(uv), self._contradicting_share(warped.depth_m, uv, z))
         if status != "ok":
             return rejected(shape, status)
-        if keyframe:
-            # Plane sweep against past images.
-            swept = self._sweep.refine(frame, working, warped)
-            surfaces = self._sweep.surfaces(frame)
+        views = self._sweep.choose_views(working.T_map_camera) if keyframe else []
+        examined = ExaminedImage(frame, working, uv, z, warped, self._sweep.keyframe_depths, views)
+        self._sweep.keep(working)
+        return examined
+
+    def between_keyframes(self, examined: ExaminedImage) -> FusionResult:
+        """Return the depth of an image: keyframe depth, else candidate surfaces, else the estimate."""
+        frame = examined.frame
+        surfaces = self._sweep.surfaces_between_keyframes(frame)
+        swept = self._depth_between_keyframes(frame, examined.warped, surfaces)
+        return self._to_full_size(examined, swept, swept.spread, keyframe=False)
+
+    def begin_keyframe(self, examined: ExaminedImage) -> Callable[[], SweptKeyframe]:
+        """Return the plane sweep of a keyframe as a function, which may run in another thread.
+
+        Meanwhile this object may be used for other images. Pass the result to `finish_keyframe`, before the
+        next call of this method.
+        """
+        is_newest = examined.depths is self._sweep.keyframe_depths
+        warped = examined.warped if is_newest else None
+        task = self._sweep.prepare(examined.frame, examined.working, examined.views, warped)
+
+        def run() -> SweptKeyframe:
+            swept, surfaces = self._sweep.sweep(task)
             sigma_log = self._sweep_sigma_log(swept, surfaces)
             self._pin_to_beams(swept, sigma_log, surfaces)
-        else:
-            # Keyframe depth, else candidate surfaces, else the estimate.
-            swept = self._depth_between_keyframes(
-                frame, warped, self._sweep.surfaces(frame, occluded_walls=False)
-            )
-            sigma_log = swept.spread
-        self._sweep.keep(working)
-        return self._to_full_size(frame, swept, sigma_log, uv, z, keyframe)
+            return SweptKeyframe(task, self._to_full_size(examined, swept, sigma_log, keyframe=True))
+
+        return run
+
+    def finish_keyframe(self, swept: SweptKeyframe) -> FusionResult:
+        """Use the depth of a keyframe for later images, and return it."""
+        self._sweep.commit(swept.task)
+        return swept.result
 
     def look(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
         """Store an image for later plane sweeps, without estimating its depth."""
@@ -181,10 +243,10 @@ class Fusion:
         return sure
 
     def _to_full_size(
-        self, frame: FusionInput, swept: SweepResult, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray,
-        keyframe: bool,
-    ) -> FusionResult:  # fmt: skip
+        self, examined: ExaminedImage, swept: SweepResult, sigma_log: np.ndarray, *, keyframe: bool
+    ) -> FusionResult:
         """Return the result at the image size, with scale, inlier share and residual (m) at the beams."""
+        frame, uv, z = examined.frame, examined.uv, examined.z_m
         h, w = self._sweep.working_camera.shape
         depth = np.empty(self._sweep.camera.shape, np.float32)
         sigma = np.empty_like(depth)

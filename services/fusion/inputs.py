@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 
 from beamsplat.common.geometry.beams import Beams
+from beamsplat.services.fusion.keyframe_depth import KeyframeDepths, WarpedDepth
 from beamsplat.services.fusion.scaling import Kind
+from beamsplat.services.fusion.surfaces import CeilingDetector
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,18 @@ class SweepResult:
     spread: np.ndarray  # float32 [h, w]: standard deviation of log depth over the label distribution
     snapped: np.ndarray  # bool [h, w]: depth set to a candidate surface (beams, floor, ceiling)
     views: int  # source images of the sweep
+
+
+@dataclass(frozen=True)
+class KeyframeTask:
+    """The sweep of one keyframe, with copies of all state that the sweep changes."""
+
+    frame: FusionInput
+    working: WorkingImage
+    views: list[WorkingImage]  # source images
+    warped: WarpedDepth | None  # `depths` in the view of `working`; None = not computed yet
+    depths: KeyframeDepths
+    ceilings: CeilingDetector
 
 
 def features(grey: np.ndarray, side: int = 9, floor_grey: float = 3.0) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from dataclasses import dataclass
 
@@ -29,6 +30,12 @@ class KeyframeDepths:
 
     def __len__(self) -> int:
         return len(self._ring)
+
+    def copy(self) -> KeyframeDepths:
+        """Return a buffer with the same depth maps, which changes independently."""
+        other = copy.copy(self)
+        other._ring = self._ring.copy()
+        return other
 
     def add(self, T_map_camera: np.ndarray, depth_m: np.ndarray) -> None:
         """Store the depth map (optical z, m, float32 [h, w]) of a keyframe; NaN pixels are not warped."""

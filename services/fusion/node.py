@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -19,11 +18,8 @@ from beamsplat.common.geometry.beams import scan_points
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.keyframe_selection import KeyframeSelector, field_of_view, sharpness
 from beamsplat.common.geometry.sensor_history import SensorHistory, TimedScan
-from beamsplat.common.geometry.transforms import transform_points
 from beamsplat.common.messages import (
-    Cloud,
     DepthEstimate,
-    FusedDepth,
     Image,
     KeyframeCandidate,
     KeyframeDecision,
@@ -42,14 +38,17 @@ from beamsplat.services.fusion.aggregation_choice import (
     make_aggregation,
 )
 from beamsplat.services.fusion.calibration.startup_check import CalibrationHealth, StartupCheck
-from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.fuse import Fusion, SweptKeyframe
+from beamsplat.services.fusion.image_work import CandidateImage, FusedImage, ImageWork
 from beamsplat.services.fusion.inputs import FusionInput
-from beamsplat.services.fusion.result import FusionResult
+from beamsplat.services.fusion.messages import cloud_message, depth_message, rejected_message
 from beamsplat.services.fusion.single_image import SingleImageFusion
 
 log = logging.getLogger("beamsplat.fusion")
 
-_IMAGES = 8  # kept until their depth estimate arrives
+_IMAGES = 16  # kept until their depth estimate arrives
+_ESTIMATES = 8  # that wait for their pose, or for this node
+_UNDECIDED = 8  # candidates without a decision
 _DECISION_PATIENCE_NS = 1_000_000_000  # a candidate without a decision is dropped after this data time
 _CHECK_AFTER_SCANS = 100  # result of the calibration check after 10 s at 10 Hz; it takes 1 to 2 s
 
@@ -69,20 +68,15 @@ class FusionConfig(NodeConfig):
     check_pairs: Remote[int] = Field(60, ge=0)  # image pairs for the check of the calibration; 0 = none
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    """An image that is ready for fusion, with the age of its beams."""
-
-    frame: FusionInput
-    age_ns: int
-
-
 class FusionNode(Node):
     """Publishes metric depth per image and a point cloud per keyframe, in the continuous odom frame.
 
     A plane sweep needs several times more computation than depth between keyframes. Therefore each image is
     first a candidate, and the keyframes service decides whether the image becomes a keyframe (plane sweep) or
     not. In a deployment without that service, the fusion service decides by the same rule.
+
+    The plane sweep is a background job, one at a time, so that it delays no other image. Images between
+    keyframes use the newest depth that is finished. Results are published in the order of the images.
     """
 
     name = "fusion"
@@ -91,7 +85,7 @@ class FusionNode(Node):
     inputs = (
         Input("rig", "every"),
         Input("camera/image", "every"),  # every image, so that each estimate finds its image
-        "depth/estimate",
+        Input("depth/estimate", "latest", keep=4),
         "lidar/scan",
         "localization/odometry",
         "localization/movers",
@@ -104,8 +98,8 @@ class FusionNode(Node):
         self._fusion: Fusion | SingleImageFusion | None = None
         self._check: StartupCheck | None = None  # of the calibration; only `field` has one
         self._images: deque[Image] = deque(maxlen=_IMAGES)
-        self._estimates: deque[DepthEstimate] = deque(maxlen=_IMAGES)
-        self._candidate: _Candidate | None = None  # waits for the decision of the keyframes service
+        self._estimates: deque[DepthEstimate] = deque()
+        self._undecided: dict[int, CandidateImage] = {}  # by stamp: wait for the keyframes service's decision
         self._rig: Rig | None = None
         self._localizer = ""  # instance of the localization process
         self.calibration: CalibrationHealth | None = None
@@ -136,18 +130,21 @@ class FusionNode(Node):
         if rig.camera is None or (rig.lidar is None and method != "given"):
             log.error("the calibration has no camera or no lidar: depth is not fused; complete the rig file")
             return iter(())
-        self._rig, camera, self._candidate = rig, rig.camera, None
+        self._rig, camera = rig, rig.camera
+        self._undecided.clear()
         self._selector = KeyframeSelector(field_of_view(Pinhole.of(camera)))
         self._undistort = Undistorter(Pinhole.of(camera))
         self._T_body_camera = camera.T_body_camera
         self._history = SensorHistory(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         if method != "field":
             self._fusion = SingleImageFusion(self._undistort.pinhole, camera.T_body_camera, method)
+            self._work = ImageWork(self._fusion)
             return iter(())
         self._fusion = Fusion(
             self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
             planar=self.config.planar, aggregation=self._aggregation,
         )  # fmt: skip
+        self._work = ImageWork(self._fusion)  # unfinished work of another odom frame or rig is dropped
         assert rig.lidar is not None  # checked above
         self._check = StartupCheck(
             self._undistort.pinhole, camera.T_body_camera, rig.lidar.T_body_lidar, self.config.check_pairs
@@ -188,7 +185,7 @@ class FusionNode(Node):
             if job is not None:
                 yield Job("check_calibration", job, after=_CHECK_AFTER_SCANS, of="lidar/scan")
             self._update_detail()
-        yield from self._fuse_if_ready()
+        yield from self._propose_ready()
 
     def _add_to_check(self, scan: TimedScan) -> None:
         T_odom_body = self._history.pose(scan.middle_ns)
@@ -226,36 +223,31 @@ class FusionNode(Node):
 
     def on_camera_image(self, image: Image) -> Outputs:
         self._images.append(image)
-        yield from self._fuse_if_ready()
+        yield from self._propose_ready()
 
     def on_depth_estimate(self, estimate: DepthEstimate) -> Outputs:
         """Queue an estimate until the pose at its time is known."""
+        if len(self._estimates) == _ESTIMATES:  # poses are late: the oldest is dropped and counted
+            self._estimates.popleft()
+            self._count_overtaken(1)
         self._estimates.append(estimate)
-        yield from self._fuse_if_ready()
+        yield from self._propose_ready()
 
-    def _fuse_if_ready(self) -> Outputs:
-        """Process the newest image that has an estimate and a pose; older images are dropped and counted."""
-        if self._candidate is not None:
-            asked_ns = self._candidate.frame.stamp_ns
-            newest_ns = self._estimates[-1].stamp_ns if self._estimates else asked_ns
-            if abs(newest_ns - asked_ns) < _DECISION_PATIENCE_NS:  # also if the clock was set back
-                return
-            self._candidate = None  # the keyframes service does not answer
-            self.overtaken += 1
-        ready = None
+    def _propose_ready(self) -> Outputs:
+        """Propose all images that have an estimate and a pose, oldest first."""
         while self._fusion is not None and self._estimates:
             if self._estimates[0].stamp_ns > self._history.newest_pose_ns:
                 break
-            self.overtaken += ready is not None
-            ready = self._estimates.popleft()
-        if ready is None:
-            return
+            estimate = self._estimates.popleft()
+            image = next((p for p in self._images if p.stamp_ns == estimate.stamp_ns), None)
+            if image is None:  # its image was lost, or is no longer kept
+                self._count_overtaken(1)
+            else:
+                yield from self._propose(image, estimate)
+
+    def _count_overtaken(self, number: int) -> None:
+        self.overtaken += number
         self._update_detail()
-        image = next((p for p in self._images if p.stamp_ns == ready.stamp_ns), None)
-        if image is None:  # its image was lost, or is no longer kept
-            self.overtaken += 1
-            return
-        yield from self._propose(image, ready)
 
     def _propose(self, image: Image, estimate: DepthEstimate) -> Outputs:
         """Publish the image as a keyframe candidate; the image is processed when the decision arrives."""
@@ -265,10 +257,11 @@ class FusionNode(Node):
                 decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
             )
         except (UserError, ValueError) as error:
-            yield "fusion/depth", _rejected(image.stamp_ns, str(error))
+            yield from self._publish(self._work.refuse(image.stamp_ns, str(error)))
             return
         if T_odom_body is None:
-            yield "fusion/depth", _rejected(image.stamp_ns, "no pose at the time of the image")
+            status = "no pose at the time of the image"
+            yield from self._publish(self._work.refuse(image.stamp_ns, status))
             return
         if self._check is not None:
             self._check.add_image(image.stamp_ns, rgb, T_odom_body)
@@ -278,82 +271,71 @@ class FusionNode(Node):
             image.stamp_ns, rgb, T_odom_body, beams, estimate.values if usable else None,
             estimate.kind if usable else "none",
         )  # fmt: skip
-        candidate, sharp = _Candidate(frame, age_ns), sharpness(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        candidate, sharp = CandidateImage(frame, age_ns), sharpness(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
         if "keyframes/decision" in self.without_producer:
             selection = self._selector.decide(T_odom_body @ self._T_body_camera, sharp)
-            yield from self._fuse(candidate, selection.selected)
+            yield from self._take(candidate, selection.selected)
             return
-        self._candidate = candidate
+        self._forget_undecided(image.stamp_ns)
+        self._undecided[image.stamp_ns] = candidate
         yield (
             "keyframes/candidate",
             KeyframeCandidate(stamp_ns=image.stamp_ns, T_odom_body=T_odom_body, sharpness=sharp),
         )
 
+    def _forget_undecided(self, now_ns: int) -> None:
+        """Drop candidates that wait too long: the keyframes service does not answer."""
+        for stamp_ns in list(self._undecided):
+            late = abs(now_ns - stamp_ns) >= _DECISION_PATIENCE_NS  # also if the clock was set back
+            if late or len(self._undecided) >= _UNDECIDED:
+                del self._undecided[stamp_ns]
+                self._count_overtaken(1)
+
     def on_keyframes_decision(self, decision: KeyframeDecision) -> Outputs:
-        """Process the candidate to which the decision belongs, then continue with the newest image."""
-        candidate = self._candidate
-        if candidate is None or candidate.frame.stamp_ns != decision.stamp_ns:
-            return
-        self._candidate = None
-        yield from self._fuse(candidate, decision.keyframe)
-        yield from self._fuse_if_ready()
+        """Process the candidate to which the decision belongs."""
+        candidate = self._undecided.pop(decision.stamp_ns, None)
+        if candidate is not None:
+            yield from self._take(candidate, decision.keyframe)
+
+    def _take(self, candidate: CandidateImage, keyframe: bool) -> Outputs:
+        postponed = self._work.postponed
+        fused_images = self._work.take(candidate, keyframe)
+        if self._work.postponed > postponed:  # the keyframes service does the same
+            self._selector.withdraw(candidate.frame.T_map_body @ self._T_body_camera)
+            self.rejections.add("keyframes postponed: earlier ones are still being computed")
+        yield from self._publish(fused_images)
 
     def awaits_feedback(self) -> bool:
         """Return whether a candidate waits for the decision of the keyframes service."""
-        return self._candidate is not None
+        return bool(self._undecided)
 
     def on_feedback_timeout(self, seconds: float) -> Outputs:
-        """Drop the waiting candidate, because the keyframes service no longer answers."""
-        if self._candidate is not None:
-            self._candidate = None
-            self.overtaken += 1
+        """Drop the waiting candidates, because the keyframes service no longer answers."""
+        if self._undecided:
+            self._count_overtaken(len(self._undecided))
+            self._undecided.clear()
         return iter(())
 
-    def _fuse(self, candidate: _Candidate, keyframe: bool) -> Outputs:
-        """Publish the depth of one image, and the point cloud if the image is a keyframe."""
-        frame = candidate.frame
-        assert self._fusion is not None  # candidates exist after the calibration only
-        fused = self._fusion.fuse(frame, keyframe=keyframe)
-        if not fused.ok:
-            if keyframe:
-                self._selector.withdraw()
-            yield "fusion/depth", _rejected(frame.stamp_ns, fused.status, keyframe)
-            return
-        T_odom_body = frame.T_map_body
-        yield "fusion/depth", _message(frame.stamp_ns, fused, keyframe, candidate.age_ns, T_odom_body)
-        if keyframe:
-            yield "fusion/cloud", self._cloud(frame.stamp_ns, fused, frame.image_rgb, T_odom_body)
+    def _publish(self, fused_images: list[FusedImage]) -> Outputs:
+        """Publish results, those of keyframes with a point cloud; start the next plane sweep."""
+        work = self._work
+        if (sweep := work.next_sweep()) is not None:
+            yield Job("sweep", lambda: (work, sweep()))
+        for fused in fused_images:
+            candidate, result = fused.candidate, fused.result
+            if candidate is None or not result.ok:
+                if candidate is not None and fused.keyframe:  # the keyframes service does the same
+                    self._selector.withdraw(candidate.frame.T_map_body @ self._T_body_camera)
+                yield "fusion/depth", rejected_message(fused.stamp_ns, result.status, fused.keyframe)
+                continue
+            yield "fusion/depth", depth_message(candidate, result, fused.keyframe)
+            if fused.keyframe:
+                camera, every_px = self._undistort.pinhole, self.config.cloud_every_px
+                cloud = cloud_message(candidate.frame, result, camera, self._T_body_camera, every_px)
+                yield "fusion/cloud", cloud
 
-    def _cloud(self, stamp_ns: int, fused: FusionResult, rgb: np.ndarray, T_odom_body: np.ndarray) -> Cloud:
-        every = self.config.cloud_every_px
-        depth = fused.depth_m[::every, ::every]
-        known = np.isfinite(depth)
-        points = (self._undistort.pinhole.ray_grid()[::every, ::every] * depth[..., None])[known]
-        return Cloud(
-            stamp_ns=stamp_ns,
-            points_odom_m=transform_points(T_odom_body @ self._T_body_camera, points).astype(np.float32),
-            colours=rgb[::every, ::every][known],
-        )
-
-
-def _message(
-    stamp_ns: int, fused: FusionResult, keyframe: bool, age_ns: int, T_odom_body: np.ndarray
-) -> FusedDepth:
-    return FusedDepth.of(
-        fused.depth_m,
-        fused.sigma_m,
-        stamp_ns=stamp_ns,
-        keyframe=keyframe,
-        scale=float(fused.scale),
-        scale_sigma=float(fused.scale_sigma),
-        inlier_share=float(fused.inlier_share),
-        residual_m=float(fused.residual_m),
-        pairs=fused.pairs,
-        beams_age_ns=age_ns,
-        T_odom_body=T_odom_body,
-    )
-
-
-def _rejected(stamp_ns: int, status: str, keyframe: bool = False) -> FusedDepth:
-    empty = np.zeros(0, np.uint8)
-    return FusedDepth(stamp_ns=stamp_ns, depth=empty, sigma=empty, status=status, keyframe=keyframe)
+    def on_job_sweep(self, result: tuple[ImageWork, SweptKeyframe]) -> Outputs:
+        """Publish the depth of a keyframe and of the images that have waited for it."""
+        work, swept = result
+        if work is self._work:  # else fusion was reset meanwhile: this depth is in an earlier odom frame
+            yield from self._publish(work.finish_sweep(swept))

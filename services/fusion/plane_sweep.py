@@ -21,6 +21,7 @@ from beamsplat.services.fusion import volume_kernels as kernels
 from beamsplat.services.fusion.aggregation import Aggregation, SemiGlobalMatching, SweepEvidence
 from beamsplat.services.fusion.inputs import (
     FusionInput,
+    KeyframeTask,
     PlaneSweepConfig,
     SweepResult,
     WorkingImage,
@@ -82,6 +83,7 @@ class PlaneSweep:
         self._lidar_map = LidarMap() if planar else None
         self._keyframe_depths = KeyframeDepths(self._K, c.shape, self.config.keyframes_kept)
         self._source_images: deque[WorkingImage] = deque(maxlen=240)
+        self._deferred_scans: list[np.ndarray] | None = None  # while a sweep reads the lidar map
         self._log_z = np.linspace(
             np.log(self.config.z_near_m), np.log(self.config.z_far_m), self.config.labels
         )
@@ -91,7 +93,11 @@ class PlaneSweep:
 
     def add_scan(self, points_map_m: np.ndarray) -> None:
         """Add the returns float64 [N, 3] of a scan, in the map frame, to the lidar map (only if `planar`)."""
-        if self._lidar_map is not None:
+        if self._lidar_map is None:
+            return
+        if self._deferred_scans is not None:
+            self._deferred_scans.append(points_map_m)
+        else:
             self._lidar_map.add(points_map_m)
 
     def downscale(self, frame: FusionInput) -> WorkingImage:
@@ -118,50 +124,78 @@ class PlaneSweep:
         T = inverse(self._source_images[-1].T_map_camera) @ T_map_camera
         return bool(np.linalg.norm(T[:3, 3]) >= 0.03 or np.trace(T[:3, :3]) <= 1.0 + 2.0 * np.cos(0.05))
 
-    def surfaces(self, frame: FusionInput, *, occluded_walls: bool = True) -> CandidateSurfaces:
-        """Return the candidate surfaces of a frame; `occluded_walls=False` omits hidden walls (faster)."""
-        heights = self._ceilings.heights(self.config.ceiling_evidence) if self._floor_known else ()
-        lidar_map = self._lidar_map if occluded_walls else None
+    def surfaces_between_keyframes(self, frame: FusionInput) -> CandidateSurfaces:
+        """Return the candidate surfaces of a frame, without walls that others hide (fast)."""
+        return self._surfaces(frame, None, self._ceilings)
+
+    def _surfaces(
+        self, frame: FusionInput, lidar_map: LidarMap | None, ceilings: CeilingDetector
+    ) -> CandidateSurfaces:
+        heights = ceilings.heights(self.config.ceiling_evidence) if self._floor_known else ()
         return self._predictor.find(frame.beams, lidar_map, frame.T_map_body, heights)
 
     def warp_into(self, working: WorkingImage) -> WarpedDepth:
         """Return the depth of past keyframes, warped into the view of `working`."""
         return self._keyframe_depths.warp_into(working.T_map_camera)
 
-    def refine(
-        self, frame: FusionInput, working: WorkingImage, warped: WarpedDepth | None = None
-    ) -> SweepResult:
-        """Return the depth of a keyframe at the working size, and store this depth for later images.
+    @property
+    def keyframe_depths(self) -> KeyframeDepths:
+        """Return the depth of the past keyframes; another object after each `commit`."""
+        return self._keyframe_depths
 
-        `warped`: the result of `warp_into(working)` if already computed; None = compute it.
+    def prepare(
+        self, frame: FusionInput, working: WorkingImage, views: list[WorkingImage], warped: WarpedDepth | None
+    ) -> KeyframeTask:
+        """Return the task for `sweep`. Until `commit`, no other task may be prepared.
+
+        Args:
+            views: source images, from `choose_views`.
+            warped: the result of `warp_into(working)` if no keyframe was committed since; None = compute it.
         """
+        self._deferred_scans = []
+        return KeyframeTask(
+            frame, working, views, warped, self._keyframe_depths.copy(), self._ceilings.copy()
+        )
+
+    def sweep(self, task: KeyframeTask) -> tuple[SweepResult, CandidateSurfaces]:
+        """Return the depth of a keyframe at the working size, and its candidate surfaces.
+
+        Changes only `task`. It may run in another thread while this object is used for other images.
+        """
+        frame, working = task.frame, task.working
         # Matching cost against past images, float32 [h, w, D].
-        cost, views = self._cost_volume(frame, working)
-        if self._floor_known and views:
+        cost = self._cost_volume(frame, working, task.views)
+        if self._floor_known and task.views:
             surfaces = self._predictor.find(frame.beams, None, frame.T_map_body, ())
-            self._find_ceilings(cost, surfaces.background_wall)
+            self._find_ceilings(cost, surfaces.background_wall, task.ceilings)
         # Candidate surfaces as priors.
-        surfaces = self.surfaces(frame)
+        surfaces = self._surfaces(frame, self._lidar_map, task.ceilings)
         matching_cost = quantised_cost(cost) if self.aggregation.uses_matching_cost else None
         np.minimum(cost, self.config.cost_cap, out=cost)
-        warped = warped or self.warp_into(working)
-        known = warped if len(self._keyframe_depths) else None
+        warped = task.warped or task.depths.warp_into(working.T_map_camera)
+        known = warped if len(task.depths) else None
         estimate = self.metric_estimate_of(frame)
         self._add_priors(cost, estimate, surfaces, known)
         # Aggregation: depth per pixel.
         h, w = self.working_camera.shape
         evidence = SweepEvidence(
             cost, matching_cost, self._log_z, working, frame.image_rgb, surfaces, known,
-            None if estimate is None else estimate.at_size(w, h), self._trust(estimate), self._rise, views,
+            None if estimate is None else estimate.at_size(w, h), self._trust(estimate), self._rise,
+            len(task.views),
         )  # fmt: skip
         swept = self._solve(evidence)
         certain = swept.spread < self.config.keyframe_max_spread
-        self._keyframe_depths.add(working.T_map_camera, np.where(certain, swept.depth_m, np.nan))
-        return (
-            self._override_by_votes(swept, self.warp_into(working))
-            if self.config.min_override_votes
-            else swept
-        )
+        task.depths.add(working.T_map_camera, np.where(certain, swept.depth_m, np.nan))
+        if self.config.min_override_votes:
+            swept = self._override_by_votes(swept, task.depths.warp_into(working.T_map_camera))
+        return swept, surfaces
+
+    def commit(self, task: KeyframeTask) -> None:
+        """Use the depth and the ceilings of a swept keyframe for later images."""
+        self._keyframe_depths, self._ceilings = task.depths, task.ceilings
+        scans, self._deferred_scans = self._deferred_scans or [], None
+        for points_map_m in scans:
+            self.add_scan(points_map_m)
 
     def _override_by_votes(self, swept: SweepResult, warped: WarpedDepth) -> SweepResult:
         """Return the sweep result, with depth replaced where >= `min_override_votes` keyframes disagree.
@@ -194,12 +228,13 @@ class PlaneSweep:
                 usable[k] = False
         return chosen
 
-    def _cost_volume(self, frame: FusionInput, working: WorkingImage) -> tuple[np.ndarray, int]:
-        """Return the matching cost float32 [h, w, D] (D depth labels) and the number of past images used."""
+    def _cost_volume(
+        self, frame: FusionInput, working: WorkingImage, views: list[WorkingImage]
+    ) -> np.ndarray:
+        """Return the matching cost against the source images `views`, float32 [h, w, D] (D depth labels)."""
         h, w = self.working_camera.shape
-        views = self.choose_views(working.T_map_camera)
         if not views:
-            return np.full((h, w, self.config.labels), 0.5 * self.config.cost_scale, np.float32), 0
+            return np.full((h, w, self.config.labels), 0.5 * self.config.cost_scale, np.float32)
         uv = detect_corners(working.grey_2x)
         initial_depth_m = (
             float(np.median(np.linalg.norm(frame.beams.points_body_m, axis=1))) if len(frame.beams) else 2.5
@@ -220,16 +255,16 @@ class PlaneSweep:
         )  # fmt: skip
         cost = np.empty_like(raw)
         kernels.box3(raw, self.config.cost_scale, cost)
-        return cost, len(views)
+        return cost
 
-    def _find_ceilings(self, cost: np.ndarray, wall: np.ndarray) -> None:
-        gain = np.zeros(len(self._ceilings.heights_m))
+    def _find_ceilings(self, cost: np.ndarray, wall: np.ndarray, ceilings: CeilingDetector) -> None:
+        gain = np.zeros(len(ceilings.heights_m))
         step = self._log_z[1] - self._log_z[0]
         kernels.plane_gain(
             cost, self._predictor.ray_z, wall, self._predictor.camera_z_m, self._log_z[0], step,
-            self._ceilings.heights_m, gain,
+            ceilings.heights_m, gain,
         )  # fmt: skip
-        self._ceilings.add(gain)
+        ceilings.add(gain)
 
     def _add_priors(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -182,6 +183,10 @@ class CeilingDetector:
         self.heights_m = np.arange(low_m, high_m, step_m)
         self._evidence = np.zeros(len(self.heights_m))
         self._apart = round(0.2 / step_m)
+
+    def copy(self) -> CeilingDetector:
+        """Return a detector with the same evidence, which changes independently."""
+        return copy.copy(self)  # `add` replaces the evidence, and nothing else changes
 
     def add(self, gain: np.ndarray) -> None:
         """Add the evidence [n] of one keyframe (`volume_kernels.plane_gain`), one value per height."""

@@ -98,7 +98,8 @@ class KeyframesNode(Node):
         self._depths: deque[FusedDepth] = deque(maxlen=_IMAGES)
         self._selector: KeyframeSelector | None = None
         self._undecided: deque[KeyframeCandidate] = deque(maxlen=_IMAGES)  # until the calibration is known
-        self._reasons: dict[int, str] = {}  # stamp of a selected image -> why; until its depth arrives
+        # Stamp of a selected image -> its T_odom_camera and why it was selected; until its depth arrives.
+        self._selected: dict[int, tuple[np.ndarray, str]] = {}
         self._T_map_odom = np.eye(4)
         self._localizer, self._map_uuid = "", ""  # the localization process, and its map
         self._reset_frame()
@@ -136,7 +137,7 @@ class KeyframesNode(Node):
     def _reset_frame(self) -> None:
         self._anchor_id, self._T_map_anchor, self._optimisation = ODOM_ORIGIN, np.eye(4), 0
         self._depths.clear()
-        self._reasons.clear()
+        self._selected.clear()
 
     def on_rig(self, rig: Rig) -> Outputs:
         """Set up camera and lidar; a second calibration restarts the selection."""
@@ -222,38 +223,47 @@ class KeyframesNode(Node):
             T_odom_camera = candidate.T_odom_body @ self._camera.T_body_camera
             selection = self._selector.decide(T_odom_camera, candidate.sharpness)
             if selection.selected:
-                self._reasons[candidate.stamp_ns] = selection.reason
-                if len(self._reasons) > _IMAGES:  # depth that never arrived
-                    del self._reasons[next(iter(self._reasons))]
+                self._selected[candidate.stamp_ns] = (T_odom_camera, selection.reason)
+                if len(self._selected) > _IMAGES:  # depth that never arrived
+                    del self._selected[next(iter(self._selected))]
             decision = KeyframeDecision(
                 stamp_ns=candidate.stamp_ns, keyframe=selection.selected, reason=selection.reason
             )
             yield "keyframes/decision", decision
 
     def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
-        """Store the depth of a selected image; if its depth was rejected, cancel the selection."""
+        """Store the depth of a selected image, and publish its keyframe if its beams are known.
+
+        If the depth was rejected, or is not that of a keyframe because fusion was busy, the selection is
+        cancelled.
+        """
         if depth.keyframe and depth.status == "ok":
             if len(self._depths) == _IMAGES:
                 self.rejections.add("keyframes lost: no pose came for them")
             self._depths.append(depth)
-        elif depth.keyframe and self._selector is not None:
-            self._selector.withdraw()
-            self._reasons.pop(depth.stamp_ns, None)
-        return iter(())
+            yield from self._publish_ready()
+        elif depth.stamp_ns in self._selected and self._selector is not None:
+            self._selector.withdraw(self._selected.pop(depth.stamp_ns)[0])
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
         """Store a pose, and publish the keyframes whose beams can be deskewed now."""
         if self._history is None or odometry.status != "ok":
             return
         self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
-        while self._depths and self._beams_are_known(self._depths[0].stamp_ns, odometry.stamp_ns):
+        yield from self._publish_ready()
+
+    def _publish_ready(self) -> Outputs:
+        """Publish the keyframes whose beams are known."""
+        while self._depths and self._beams_are_known(self._depths[0].stamp_ns):
             yield from self._publish(self._depths.popleft())
 
-    def _beams_are_known(self, image_ns: int, pose_ns: int) -> bool:
+    def _beams_are_known(self, image_ns: int) -> bool:
         """Return whether the scan around the image time is complete, or the time limit for it is over."""
+        if self._history is None:
+            return False
+        pose_ns = self._history.newest_pose_ns
         if pose_ns < image_ns + _BEAMS_NS:
             return False
-        assert self._history is not None  # depths are queued after the calibration only
         return self._history.decided_scan_near(image_ns) or pose_ns >= image_ns + _BEAMS_PATIENCE_NS
 
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
@@ -292,7 +302,7 @@ class KeyframesNode(Node):
             self.rejections.add("keyframes lost: their image was too old")
             return
         try:
-            frame = self._keyframe(image, depth, self._reasons.pop(depth.stamp_ns, ""))
+            frame = self._keyframe(image, depth, self._selected.pop(depth.stamp_ns, (None, ""))[1])
         except ValueError as error:  # the image is damaged, or the depth has another size
             log.warning("a keyframe is lost: %s", error)
             self.rejections.add("keyframes cannot be made of their image or depth")

@@ -144,7 +144,10 @@ class TrainingDrive:
             if fault == "no keyframes":
                 unknown = np.full_like(warped.depth_m, np.nan)
                 warped = WarpedDepth(unknown, np.zeros_like(warped.votes))
-            self._sweep.refine(frame, working, warped)
+            views = self._sweep.choose_views(working.T_map_camera)
+            task = self._sweep.prepare(frame, working, views, warped)
+            self._sweep.sweep(task)
+            self._sweep.commit(task)
             self._last_keyframe = T_map_body
             sample = self._sample(depth_m) if is_sample else None
         if fault != "few images" or rng.random() < 0.3:

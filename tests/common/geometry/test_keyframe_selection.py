@@ -66,8 +66,16 @@ def test_a_selection_that_is_withdrawn_is_made_up_for_by_the_next_image():
     selector = KeyframeSelector(FOV_RAD, SelectionSettings(distance_m=0.3))
     assert selector.decide(pose(0.0), 1.0).selected
     assert selector.decide(pose(0.4), 1.0).selected
-    selector.withdraw()
+    selector.withdraw(pose(0.4))
     assert selector.decide(pose(0.42), 1.0).selected
+    assert not selector.decide(pose(0.45), 1.0).selected
+
+
+def test_a_selection_that_is_withdrawn_after_the_next_one_changes_nothing():
+    selector = KeyframeSelector(FOV_RAD, SelectionSettings(distance_m=0.3))
+    assert selector.decide(pose(0.0), 1.0).selected
+    assert selector.decide(pose(0.4), 1.0).selected
+    selector.withdraw(pose(0.0))
     assert not selector.decide(pose(0.45), 1.0).selected
 
 

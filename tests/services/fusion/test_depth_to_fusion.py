@@ -7,7 +7,9 @@ import pytest
 from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.messages import DepthEstimate, Image, Odometry, Rig, Scan
 from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.common.runtime.node import Job
 from beamsplat.services.depth.node import DepthNode
+from beamsplat.services.depth.source import Estimate
 from beamsplat.services.fusion.calibration.startup_check import CalibrationHealth
 from beamsplat.services.fusion.node import FusionNode
 from beamsplat.tools.system.assembly import build_node
@@ -78,15 +80,18 @@ def test_images_are_swept_as_the_keyframes_service_decides(shared_dir):
     assert 2 <= len(selected) < 0.5 * len(decisions)
 
 
-def test_a_candidate_without_an_answer_is_dropped_and_counted():
+def test_candidates_without_an_answer_are_dropped_and_counted():
     node = FusionNode(FusionNode.Config())
     node.configure()
     out = _feed(node, RIG, _scan(7 * S), _odometry(7 * S))
     for k in range(15):
         out += _feed(node, *_moment(k, _live_image(k)))
-    assert [topic for topic, _ in out] == ["keyframes/candidate"] * 2
-    assert node.overtaken > 0
+    assert {topic for topic, _ in out} == {"keyframes/candidate"}
+    assert len(out) == 15
+    assert node.overtaken == 15 - 8  # the others may still be answered
     assert node.awaits_feedback()
+    list(node.on_feedback_timeout(1.0))
+    assert (node.overtaken, node.awaits_feedback()) == (15, False)
 
 
 def _scan(stamp_ns):
@@ -113,7 +118,13 @@ def _feed(node, *messages):
     topics = {Rig: "rig", Scan: "lidar/scan", Odometry: "localization/odometry", Image: "camera/image",
               DepthEstimate: "depth/estimate"}  # fmt: skip
     for message in messages:
-        out += list(node.handle(topics[type(message)], message))
+        waiting = list(node.handle(topics[type(message)], message))
+        while waiting:
+            output = waiting.pop(0)
+            if isinstance(output, Job):
+                waiting = [*node.handle_job(output.name, output.run()), *waiting]
+            else:
+                out.append(output)
     return out
 
 
@@ -129,14 +140,31 @@ def test_an_estimate_waits_for_the_pose_of_its_image():
     assert np.isfinite(estimate.values).mean() > 0.5
 
 
-def test_only_the_newest_ready_image_is_worked_on_and_the_others_are_counted():
-    node = DepthNode(DepthNode.Config(source="stixel"))
+class Looking:
+    """A depth source that looks at the image, and waits for the beams."""
+
+    uses_beams = True
+
+    def estimate(self, view):
+        return Estimate(np.ones(view.image_rgb.shape[:2], np.float32), "metric")
+
+
+def test_a_source_that_looks_at_images_works_on_the_newest_and_the_others_are_counted():
+    node = DepthNode(DepthNode.Config(source="tests.services.fusion.test_depth_to_fusion:Looking"))
     node.configure()
     _feed(node, RIG, _odometry(0), _scan(0), _image(2 * S // 10), _image(6 * S // 10), _image(15 * S // 10))
     ((_, estimate),) = _feed(node, _odometry(S))
     assert estimate.stamp_ns == 6 * S // 10
     assert node.overtaken == 1
     assert "overtaken" in node.detail
+
+
+def test_a_geometric_source_works_on_every_image():
+    node = DepthNode(DepthNode.Config(source="stixel"))
+    node.configure()
+    _feed(node, RIG, _odometry(0), _scan(0), _image(2 * S // 10), _image(6 * S // 10), _image(15 * S // 10))
+    assert [m.stamp_ns for _, m in _feed(node, _odometry(S))] == [2 * S // 10, 6 * S // 10]
+    assert node.overtaken == 0
 
 
 def test_an_image_of_another_size_is_refused_with_both_sizes():

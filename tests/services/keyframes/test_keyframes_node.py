@@ -11,6 +11,7 @@ from beamsplat.common.messages import (
     Image,
     Keyframe,
     KeyframeAck,
+    KeyframeCandidate,
     LidarModel,
     MovingBeams,
     Odometry,
@@ -99,7 +100,7 @@ def test_raw_pictures_are_compressed():
 def test_without_an_answer_the_oldest_is_sent_again():
     node, frames = keyframes_of(KeyframesConfig(retry_s=1.0), drive=r.DriveConfig(pictures=16))
     ids = [f.id for f in frames]
-    assert ids.count(ids[0]) == 3  # again after one second and after two
+    assert ids.count(ids[0]) == 4  # again after one, two and three seconds
     assert len(set(ids)) == 4
     assert "4 not acknowledged" in node.detail
     figures = {figure.name: figure.value for figure in node.figures.report()}
@@ -114,6 +115,38 @@ def test_an_answer_ends_it():
     assert (
         " 0 not acknowledged" in node.detail or "1 not acknowledged" in node.detail
     )  # the last one's comes late
+
+
+def test_a_selected_image_whose_depth_is_not_that_of_a_keyframe_is_replaced_by_the_next():
+    """Fusion was busy with earlier keyframes: the selection is cancelled, so that the map gets no hole."""
+    node = KeyframesNode(KeyframesConfig())
+    node.configure()
+    list(
+        node.handle(
+            "rig", Rig(stamp_ns=r.T0, camera=r.CAMERA_MODEL, lidar=LidarModel(T_body_lidar=np.eye(4)))
+        )
+    )
+
+    def decide(number):
+        candidate = KeyframeCandidate(stamp_ns=r.T0 + number, T_odom_body=r.T_map_body(number), sharpness=1.0)
+        ((_, decision),) = node.handle("keyframes/candidate", candidate)
+        return decision.keyframe
+
+    def answer(number, keyframe):
+        depth = np.ones((r.HEIGHT, r.WIDTH), np.float32)
+        fused = FusedDepth(stamp_ns=r.T0 + number, depth_m=depth, sigma_m=depth, keyframe=keyframe)
+        assert list(node.handle("fusion/depth", fused)) == []
+
+    assert decide(0)
+    answer(0, True)
+    assert not decide(1)
+    answer(1, False)
+    assert decide(5)
+    answer(5, False)
+    assert decide(6)
+    assert decide(11)
+    answer(6, False)  # selected before the last one: nothing is to be replaced
+    assert not decide(12)
 
 
 # --- beams and movers: handlers driven by hand ---
