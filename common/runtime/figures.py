@@ -42,6 +42,7 @@ FIGURES: dict[str, FigureKind] = {
     "map_refused_keyframes": FigureKind("Keyframes that the mapper has refused."),
     "map_gaussians": FigureKind("Gaussians in the map."),
     "map_steps_total": FigureKind("Optimisation steps of the mapper.", counter=True),
+    "map_owed_steps": FigureKind("Optimisation steps that are done when no keyframe waits."),
     "map_psnr_decibels": FigureKind("PSNR of the newest keyframe after it was added."),
     "map_depth_error_meters": FigureKind("Median difference of rendered and fused depth, newest keyframe."),
     "depth_scale_ratio": FigureKind("Metres per unit of the depth estimate, of the newest image."),

@@ -16,7 +16,7 @@ Steps = Annotated[int, Field(ge=0, le=100_000)]
 
 
 class MappingConfig(NodeConfig):
-    """Options of the mapping service. The work per keyframe and per tick is fixed.
+    """Options of the mapping service. The work per keyframe and per tick is fixed; part of it can wait.
 
     `threads` is the number of threads of the CPU engine.
     """
@@ -27,10 +27,12 @@ class MappingConfig(NodeConfig):
     nice: Annotated[int, Field(ge=0, le=19)] = 5  # lower CPU priority than the services that feed the map
     half_steps: Remote[Steps] = 18  # per keyframe, at half size
     full_steps: Remote[Steps] = 5
-    tick_steps: Remote[Steps] = 6  # per tick without waiting keyframes, at full size
+    tick_steps: Remote[Steps] = 6  # per tick without waiting keyframes and owed steps, at full size
     mend_steps: Remote[Steps] = 30  # after anchors have moved, at half size: closes gaps at submap borders
     final_steps: Remote[Steps] = 0  # at the end of the data, on all keyframes
-    calm_backlog: Remote[Annotated[int, Field(ge=1)]] = 5  # with more keyframes waiting, fewer steps each
+    # Wanted delay from an image to the map, in time of the data: the nearer to it, the fewer steps follow an
+    # insertion at once. The others are done while no keyframe waits.
+    latency_s: Remote[PositiveFinite] = 1.0
     max_gaussians: Annotated[int, Field(ge=1000)] | None = None  # see `gaussians`
     max_keyframes: Annotated[int, Field(ge=4)] = 800
     refine_pose: Remote[bool] = True

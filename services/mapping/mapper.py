@@ -24,6 +24,7 @@ from beamsplat.services.mapping.insertion import new_gaussians, prediction_quali
 from beamsplat.services.mapping.keyframe import PyramidLevel, RgbdKeyframe, StoredKeyframe, compress
 from beamsplat.services.mapping.pose_bins import PoseBins
 from beamsplat.services.mapping.settings import MapperSettings
+from beamsplat.services.mapping.step_plan import StepPlan
 
 FULL, HALF = 0, 1  # indices of StoredKeyframe.levels
 _MAX_DROPPED_IDS = 4096  # ids of dropped keyframes remembered; a robot's queue holds fewer to send again
@@ -73,6 +74,7 @@ class Mapper:
         self.T_map_anchor: dict[int, np.ndarray] = {}
         self.pose_revision = 0  # number of moves of anchors in this process
         self.steps = 0  # of the optimiser, in all
+        self.plan = StepPlan()  # steps that are owed
         self.must_stop: Callable[[], bool] = lambda: False  # asked between two steps: ends them early
         self._random = np.random.default_rng(seed)
         self._newest: list[int] = []
@@ -213,11 +215,13 @@ class Mapper:
         return {
             "steps": self.steps, "newest": list(self._newest), "forgotten": list(self._dropped),
             "given_up": self.dropped_count, "random": self._random.bit_generator.state,
+            "owed": self.plan.progress(),
         }  # fmt: skip
 
     def resume(self, progress: dict[str, Any]) -> None:
         """Restore the counters and the random state that `progress` returned."""
         self.steps = progress["steps"]
+        self.plan.resume(progress.get("owed", []))
         self._newest = [id for id in progress["newest"] if id in self.keyframes]
         self._dropped = dict.fromkeys(progress["forgotten"])
         self.dropped_count = progress.get("given_up", len(self._dropped))
@@ -278,6 +282,24 @@ class Mapper:
             return 0.0
         sizes = (*repeat(HALF, half), *repeat(FULL, full))
         return self._run([(self._draw(), size) for size in sizes], refining=False)
+
+    @property
+    def has_owed_steps(self) -> bool:
+        """Return whether `optimise_owed` would do steps."""
+        return self.plan.count > 0 and bool(self.keyframes) and self.store.count > 0
+
+    def optimise_owed(self) -> None:
+        """Do the next piece of owed steps. Steps that `must_stop` prevents are owed still."""
+        if not self.has_owed_steps or (steps := self.plan.take(HALF)) is None:
+            return
+        before = self.steps
+        if steps.kind == "refine":
+            self.refine(steps.count, steps.size)
+        elif steps.size == HALF:
+            self.optimise(steps.count, 0)
+        else:
+            self.optimise(0, steps.count)
+        self.plan.owe(steps.kind, steps.size, steps.count - (self.steps - before), first=True)
 
     def refine(self, iterations: int, size: int = FULL) -> float:
         """Do `iterations` steps on keyframes in random order, each equally often; return the mean loss."""

@@ -93,7 +93,9 @@ class MappingNode(Node):
             max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
         )  # fmt: skip
         self._mapper = Mapper(settings, seed=c.seed, engine=make_engine(c.engine, c.threads))
-        self._mapper.must_stop = self.must_stop
+        self._mapper.must_stop = self._must_pause
+        self._now_ns = 0  # newest stamp that has arrived: the time of the data
+        self._interruptible = self._interrupted = False  # owed steps, by the arrival of a keyframe
         self._intake = KeyframeIntake(self._mapper)
         self._feed = ChunkFeed()
         self._viewpoint: Viewpoint | None = None  # of the newest keyframe
@@ -145,6 +147,11 @@ class MappingNode(Node):
 
     def on_arrival(self, topic: str, message: Message) -> Outputs:
         """Write a received keyframe to the session and acknowledge it, before it is processed."""
+        if isinstance(message, Tick):
+            self._now_ns = message.stamp_ns
+        elif isinstance(message, Keyframe):
+            self._now_ns = max(self._now_ns, message.stamp_ns)
+            self._interrupted = True
         if isinstance(self._session, NoSession) or not isinstance(message, Keyframe):
             return
         reason = self._intake.rejections.get(message.id)
@@ -152,7 +159,7 @@ class MappingNode(Node):
             yield ack(message, reason or "ok")
 
     def on_keyframes_frame(self, message: Keyframe) -> Outputs:
-        """Insert a keyframe, optimise a fixed number of steps, publish preview, status and chunk."""
+        """Insert a keyframe, optimise as the delay allows, publish preview, status and chunk."""
         yield from self._take(message, from_disk=False)
 
     def _take(self, message: Keyframe, *, from_disk: bool) -> Outputs:
@@ -169,16 +176,44 @@ class MappingNode(Node):
             self._session.remove(message.id)
             yield "mapping/status", self._status(message.stamp_ns, outcome, 0.0)
             return
-        c, waiting = self.config, self._backlog + self._session.waiting
-        share = min(c.calm_backlog / max(waiting, 1), 1.0)
-        loss = self._mapper.optimise(math.ceil(c.half_steps * share), math.ceil(c.full_steps * share))
+        c, plan, delay_s = self.config, self._mapper.plan, (self._now_ns - message.stamp_ns) * 1e-9
+        half, full = plan.at_once(delay_s, c.latency_s, c.half_steps, c.full_steps)
+        loss = self._mapper.optimise(half, full)
+        plan.owe("window", HALF, c.half_steps - half)
+        plan.owe("window", FULL, c.full_steps - full)
         self._session.keep_budget()
-        yield from self._show(message, outcome, loss)
-        if len(self._mapper.keyframes) % c.chunk_every == 0:
-            census = ChunkCensus(self._mapper, self._viewpoint)
-            yield from self._chunk(census, message.anchor_id, message.stamp_ns)
+        if delay_s < c.latency_s:
+            yield from self._show(message, outcome, loss)
+            if len(self._mapper.keyframes) % c.chunk_every == 0:
+                census = ChunkCensus(self._mapper, self._viewpoint)
+                yield from self._chunk(census, message.anchor_id, message.stamp_ns)
+        else:  # ticks publish the chunk; nobody waits for the preview
+            yield "mapping/status", self._status(message.stamp_ns, outcome, loss)
         if not from_disk:  # its stamp would be an old one, between new ones: a checkpoint each time
             yield from self._checkpoint(message.stamp_ns)
+
+    def has_idle_work(self) -> bool:
+        """Return whether steps are owed, or keyframes wait on the disk."""
+        return (self._session.has_skipped or self._mapper.has_owed_steps) and not self.must_stop()
+
+    def on_idle(self) -> Outputs:
+        """Insert a keyframe that waits on the disk, else do a piece of the owed steps."""
+        if self._session.has_skipped:
+            yield from self._skipped()
+            return
+        self._interrupted, self._interruptible = False, True
+        self._mapper.optimise_owed()
+        self._interruptible = False
+        self._report_owed()
+
+    def _report_owed(self) -> None:
+        plan = self._mapper.plan
+        self.figures.set("map_owed_steps", plan.count)
+        self.rejections.set("optimisation steps never done: too many were owed", plan.dropped)
+
+    def _must_pause(self) -> bool:
+        """Return whether the steps must end: with the process, or because a keyframe has arrived."""
+        return self.must_stop() or (self._interruptible and self._interrupted)
 
     def _skipped(self) -> Outputs:
         """Insert one keyframe that waits on the disk."""
@@ -196,7 +231,7 @@ class MappingNode(Node):
     # --- anchors and time ---
 
     def on_localization_anchors(self, anchors: Anchors) -> Outputs:
-        """Move the Gaussians to the new anchor poses, then optimise to close gaps at submap borders."""
+        """Move the Gaussians to the new anchor poses; later, steps close the gaps at submap borders."""
         if reason := self._intake.other_map(anchors.map_uuid):
             log.warning("anchors are ignored: %s", reason)
             return
@@ -206,14 +241,15 @@ class MappingNode(Node):
             # Viewers move the chunks that they have. What the steps change follows with the next chunks.
             yield "mapping/anchors", anchors_message(self._mapper, anchors.stamp_ns)
             self._session.anchors_moved()
-            self._mapper.refine(self.config.mend_steps, HALF)
+            self._mapper.plan.mend(HALF, self.config.mend_steps)
 
     def on_tick(self, tick: Tick) -> Outputs:
-        """Refine the map (or insert a skipped keyframe), and publish the due chunk that is oldest."""
+        """Plan steps on the whole map, or insert a skipped keyframe; publish the due chunk that is oldest."""
         if self._session.has_skipped:
             yield from self._skipped()
         elif self._mapper.keyframes:
-            self._mapper.refine(self.config.tick_steps, FULL)
+            if self._mapper.plan.count == 0:
+                self._mapper.plan.owe("refine", FULL, self.config.tick_steps)
             self._session.keep_budget()
         if not self._mapper.keyframes:
             return
@@ -238,8 +274,11 @@ class MappingNode(Node):
         depth_error_m: float = math.nan,
     ) -> MapStatus:  # fmt: skip
         m, keyframes, rejected = self._mapper, len(self._intake.stored()), len(self._intake.rejections)
+        self._report_owed()
         gaussians, session = m.store.count + m.store.paged_out_count, self._session.status_text()
-        self.detail = f"{keyframes} keyframes, {gaussians} Gaussians, {psnr_db:.1f} dB" + (
+        quality = f", {psnr_db:.1f} dB" if math.isfinite(psnr_db) else ""
+        waiting = f", {self._backlog} wait on the robot" if self._backlog else ""
+        self.detail = f"{keyframes} keyframes{waiting}, {gaussians} Gaussians{quality}" + (
             f", {rejected} refused (last: {outcome.status})" if not outcome.ok else ""
         )
         self.detail += f"; {session}" if session else ""
@@ -324,6 +363,8 @@ class MappingNode(Node):
         self._session.end_of_input()
         while self._session.waiting and not self.must_stop():
             yield from self._skipped()
+        while self._mapper.has_owed_steps and not self.must_stop():
+            self._mapper.optimise_owed()
         if not self._mapper.keyframes:
             return
         yield from self._publish_all()

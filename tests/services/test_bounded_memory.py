@@ -236,6 +236,8 @@ class Player:
         self._take(self.node.handle_arrival(topic, message))
         self.node.on_header(header)
         self._take(self.node.handle(topic, message))
+        while self.node.has_idle_work():
+            self._take(self.node.handle_idle())
 
     def end(self) -> None:
         self._take(self.node.handle_drain())

@@ -92,7 +92,7 @@ def test_a_resumed_mapper_decodes_a_keyframe_when_it_needs_it(saved):
 
 def test_a_resumed_mapper_works_before_it_has_inserted_what_is_newer_than_its_checkpoint(saved):
     """A backlog of hours on disk delays neither new keyframes nor the state "active"; sent again, it is known."""
-    node = make_node(saved, half_steps=10, full_steps=10, calm_backlog=1)
+    node = make_node(saved, half_steps=10, full_steps=10)
     assert len(node._mapper.keyframes) == 4
     sent = feed(node, [7, 5])
     assert [ack.id for ack in sent["keyframes/ack"]] == [message(7).id]
