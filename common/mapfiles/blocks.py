@@ -100,10 +100,16 @@ def read_block(folder: Path, block: Block, T_map_anchor: np.ndarray) -> Arrays:
         raise UserError(f"{path}: cannot be read ({error.strerror}); restore it from a copy") from error
     except ValueError as error:
         raise UserError(f"{path}: {error}; restore it from a copy") from error
-    if not np.array_equal(T_map_anchor, block.T_map_anchor):
-        move = T_map_anchor @ inverse(block.T_map_anchor)
-        arrays["params"], arrays["first"] = transform_with_momentum(arrays["params"], arrays["first"], move)
-    return arrays
+    return placed(arrays, block, T_map_anchor)
+
+
+def placed(arrays: Arrays, block: Block, T_map_anchor: np.ndarray) -> Arrays:
+    """Return the arrays of a block as they were written, transformed to the current pose of its anchor."""
+    if np.array_equal(T_map_anchor, block.T_map_anchor):
+        return arrays
+    move = T_map_anchor @ inverse(block.T_map_anchor)
+    params, first = transform_with_momentum(arrays["params"], arrays["first"], move)
+    return arrays | {"params": params, "first": first}
 
 
 def _unpacked(blob: bytes) -> Arrays:

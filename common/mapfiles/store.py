@@ -86,17 +86,32 @@ class GaussianStore(GaussianArrays):
 
     @property
     def bytes_each(self) -> int:
-        """Return the bytes of one Gaussian in all arrays."""
+        """Return the bytes of one Gaussian in host memory."""
+        return self.copied_bytes_each
+
+    @property
+    def copied_bytes_each(self) -> int:
+        """Return the bytes of one Gaussian in the result of `state`."""
         return sum(getattr(self, name).nbytes for name in self._arrays()) // self.capacity
+
+    def limit_capacity(self, count: int) -> None:
+        """Set the number of Gaussians beyond which arrays grow no further than needed.
+
+        No effect on arrays in host memory: unused columns take none.
+        """
 
     def state(self) -> dict[str, np.ndarray]:
         """Return copies of all arrays, trimmed to `count` columns, and the event counters.
 
         The keys are the names in saved files.
         """
-        out = {saved_name(name): getattr(self, name)[..., : self.count].copy() for name in self._arrays()}
+        out = {saved_name(name): self._copied(name) for name in self._arrays()}
         out["events"] = np.array(list(self._events.items()), np.int64).reshape(-1, 2)
         return out
+
+    def _copied(self, name: str) -> np.ndarray:
+        """Return a copy of an array, trimmed to `count` columns."""
+        return getattr(self, name)[..., : self.count].copy()
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Replace the contents by a result of `state`.
@@ -219,6 +234,29 @@ class GaussianStore(GaussianArrays):
     def chunk(self, anchor: int) -> np.ndarray:
         """Return a copy of an anchor's Gaussians in memory, float32 [14, N], in the map frame."""
         return self.params[:, : self.count][:, self.anchor[: self.count] == anchor]
+
+    # What the clients of an engine read: a store in device memory computes or copies just this.
+
+    def rows(self, first: int, stop: int) -> np.ndarray:
+        """Return the rows `first` to `stop` - 1 of the parameters, float32 [rows, count]; read-only."""
+        return self.params[first:stop, : self.count]
+
+    def selected(self, group: np.ndarray) -> np.ndarray:
+        """Return a copy of the parameters of the columns `group` int [N], float32 [14, N]."""
+        return self.params[:, group]
+
+    def nearest_m(self, anchor: int, at_map_m: np.ndarray) -> float:
+        """Return the distance (m) from a point float64 [3] to the nearest centre of an anchor's Gaussians.
+
+        It is inf if none is in memory.
+        """
+        means = self.params[MEAN:SCALE, : self.count][:, self.anchor[: self.count] == anchor].T
+        return float(np.sqrt(np.min(np.sum((means - at_map_m) ** 2, axis=1), initial=np.inf)))
+
+    def survivors(self, votes: int, opacity_logit: float) -> np.ndarray:
+        """Return bool [count]: Gaussians with fewer carving votes than `votes` and a higher opacity."""
+        opaque = self.params[OPACITY, : self.count] > opacity_logit
+        return (self.carving_votes[: self.count] < votes) & opaque
 
     def chunks(self, known: dict[int, int] | None = None) -> list[Chunk]:
         """Return copies of the chunks whose version differs from that in `known` (default: all chunks)."""

@@ -158,6 +158,10 @@ class Node:
             UserError: a file or device is missing or unusable.
         """
 
+    def options(self) -> NodeConfig:
+        """Return the options as they take effect on this machine; may be called before `configure`."""
+        return self.config
+
     def drain(self) -> Iterable[Output]:
         """Return the node's last output messages; called once, after all inputs have ended."""
         return ()

@@ -11,7 +11,7 @@ import numpy as np
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.detail import detail_cell_m, merge_by_cell
 from beamsplat.common.mapfiles.store import transform_gaussians
-from beamsplat.common.raster.layout import MEAN
+from beamsplat.common.raster.layout import MEAN, SCALE
 from beamsplat.services.mapping.mapper import Mapper
 
 _NEVER = (-1, 0.0, -1)  # version, cell and time of a chunk that has not been published
@@ -58,7 +58,7 @@ class ChunkCensus:
         store, c = self._mapper.store, self._census
         if not c.anchors:
             return {}
-        means = store.params[MEAN : MEAN + 3, : store.count]
+        means = store.rows(MEAN, SCALE)
         squared = np.sum((means - self._viewpoint.at_map_m[:, None]) ** 2, axis=0)
         nearest = np.sqrt(np.minimum.reduceat(squared[c.order], c.starts))
         return dict(zip(c.anchors, nearest.tolist()))
@@ -83,7 +83,7 @@ class ChunkCensus:
         """Return the chunk of an anchor: all Gaussians in memory and on disk, merged by cell."""
         mapper = self._mapper
         columns = self._columns.get(anchor, np.zeros(0, np.int64))
-        parts = [mapper.store.params[:, columns], *disk_params(mapper, anchor)]
+        parts = [mapper.store.selected(columns), *disk_params(mapper, anchor)]
         params = transform_gaussians(np.concatenate(parts, axis=1), inverse(mapper.T_map_anchor[anchor]))
         return ChunkUpdate(self.versions[anchor], cell_m, merge_by_cell(params, cell_m))
 

@@ -3,37 +3,43 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
 from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.engines.choice import EngineName
+from beamsplat.services.mapping.profiles import PAGED_GAUSSIANS, PROFILES
 
 PositiveFinite = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-EngineName = Literal["auto", "cpu", "cuda"]
 Steps = Annotated[int, Field(ge=0, le=100_000)]
+Stride = Annotated[int, Field(ge=1, le=64)]
+_CPU = PROFILES["cpu"]
 
 
 class MappingConfig(NodeConfig):
     """Options of the mapping service. The work per keyframe and per tick is fixed; part of it can wait.
 
-    `threads` is the number of threads of the CPU engine.
+    `threads` is the number of threads of the CPU engine. The defaults of the numbers of steps, of the strides
+    and of `max_gaussians` are those of the CPU engine; on a GPU they are higher and finer (`profiles.py`).
     """
 
     # What computes the map. "auto": the GPU if there is one with a driver and torch, else the CPU.
     engine: EngineName = "auto"
 
     nice: Annotated[int, Field(ge=0, le=19)] = 5  # lower CPU priority than the services that feed the map
-    half_steps: Remote[Steps] = 18  # per keyframe, at half size
-    full_steps: Remote[Steps] = 5
-    tick_steps: Remote[Steps] = 6  # per tick without waiting keyframes and owed steps, at full size
-    mend_steps: Remote[Steps] = 30  # after anchors have moved, at half size: closes gaps at submap borders
+    half_steps: Remote[Steps] = _CPU.half_steps  # per keyframe, at half size
+    full_steps: Remote[Steps] = _CPU.full_steps
+    tick_steps: Remote[Steps] = _CPU.tick_steps  # per tick without waiting keyframes and owed steps
+    mend_steps: Remote[Steps] = _CPU.mend_steps  # after anchors have moved, at half size: closes gaps
     final_steps: Remote[Steps] = 0  # at the end of the data, on all keyframes
     # Wanted delay from an image to the map, in time of the data: the nearer to it, the fewer steps follow an
     # insertion at once. The others are done while no keyframe waits.
     latency_s: Remote[PositiveFinite] = 1.0
-    max_gaussians: Annotated[int, Field(ge=1000)] | None = None  # see `gaussians`
+    stride_px: Remote[Stride] = _CPU.stride_px  # between new Gaussians
+    fine_stride_px: Remote[Stride] = _CPU.fine_stride_px  # the same where the image has texture
+    max_gaussians: Annotated[int, Field(ge=1000)] | None = None  # None: see `for_engine`
     max_keyframes: Annotated[int, Field(ge=4)] = 800
     refine_pose: Remote[bool] = True
     refine_exposure: Remote[bool] = True
@@ -43,8 +49,17 @@ class MappingConfig(NodeConfig):
     save: Path | None = None  # folder for splats.ply and keyframes.tum, written at the end of the data
     session: Path | None = None  # folder of the saved map: written while mapping, resumed at the start
     memory_mb: PositiveFinite | None = None  # budget of this process; the rest is on disk
+    gpu_memory_mb: PositiveFinite | None = None  # budget of GPU memory; the rest is in memory and on disk
     session_every_s: PositiveFinite = 30.0  # between checkpoints, in time of the data
 
-    def gaussians(self) -> int:
-        """Return `max_gaussians`, by default 300 000 without `memory_mb`, else 20 million."""
-        return self.max_gaussians or (300_000 if self.memory_mb is None else 20_000_000)
+    def for_engine(self, name: str) -> MappingConfig:
+        """Return the options with the defaults of an engine, "cpu" or "cuda", for those that are not set.
+
+        With a budget of memory that the engine keeps, `max_gaussians` is 20 million by default.
+        """
+        profile = PROFILES[name]
+        paged = self.memory_mb is not None or (name == "cuda" and self.gpu_memory_mb is not None)
+        if paged:
+            profile = profile._replace(max_gaussians=PAGED_GAUSSIANS)
+        given = {key for key in self.model_fields_set if getattr(self, key) is not None}
+        return self.model_copy(update={k: v for k, v in profile._asdict().items() if k not in given})

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from beamsplat.common.engines.coverage import differing_pixels
 from beamsplat.common.raster.discs import choose_pixels, make_discs
 from beamsplat.services.mapping.keyframe import PyramidLevel
 from beamsplat.services.mapping.settings import MapperSettings
@@ -19,16 +19,12 @@ def unexplained_pixels(
     settings: MapperSettings,
 ) -> np.ndarray:
     """Return bool [H, W]: pixels where the render is transparent, or its colour or trusted depth is wrong."""
-    alpha = image[4]
     rgb = level.rgb.astype(np.float32) * np.float32(1 / 255)
-    # Averaged over 5 px: edges displaced by half a pixel are left to the optimiser.
-    colour_off = cv2.blur(np.abs(image[:3] - rgb).mean(axis=0), (5, 5)) > settings.max_colour_error
     depth = level.depth_mm.astype(np.float32) * np.float32(1e-3)
-    expected = image[3] / np.maximum(alpha, 1e-3)
-    trusted = level.depth_weight >= _TRUSTED_WEIGHT
-    depth_off = (trusted & (np.abs(expected - depth) > settings.max_depth_error * depth)).astype(np.uint8)
-    depth_off = cv2.erode(depth_off, np.ones((5, 5), np.uint8)) > 0
-    return (alpha < settings.min_alpha) | colour_off | depth_off
+    return differing_pixels(
+        image, rgb, depth, level.depth_weight >= _TRUSTED_WEIGHT, min_alpha=settings.min_alpha,
+        max_colour_error=settings.max_colour_error, max_depth_error=settings.max_depth_error,
+    )  # fmt: skip
 
 
 def new_gaussians(

@@ -17,7 +17,6 @@ import numpy as np
 from beamsplat.common.geometry.transforms import inverse, is_rigid
 from beamsplat.common.mapfiles.store import DiskGaussians, GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.layout import OPACITY
 from beamsplat.services.mapping.engines.cpu import CpuEngine, count_votes
 from beamsplat.services.mapping.engines.protocol import Engine, OptimiserStep
 from beamsplat.services.mapping.insertion import new_gaussians, prediction_quality, unexplained_pixels
@@ -263,9 +262,7 @@ class Mapper:
         s, store = self.settings, self.store
         self.engine.vote_carving(keyframe.levels[HALF], self.T_map_camera(keyframe), s)
         faint = np.log(s.prune_opacity / (1.0 - s.prune_opacity))
-        keep = (store.carving_votes[: store.count] < s.carve_votes) & (
-            store.params[OPACITY, : store.count] > faint
-        )
+        keep = store.survivors(s.carve_votes, faint)
         # Compaction copies all arrays: only from 0.5 % of the Gaussians.
         return store.keep(keep) if np.count_nonzero(~keep) > store.count // 200 else 0
 

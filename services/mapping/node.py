@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from itertools import chain
 
+from beamsplat.common.engines.choice import check_cuda, cuda_obstacle
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.mapfiles.ply import write_map
@@ -23,10 +24,11 @@ from beamsplat.common.messages import (
     Tick,
 )
 from beamsplat.common.messages.header import Header
+from beamsplat.common.raster.layout import PARAMS
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs, StopRequested
 from beamsplat.services.mapping.chunks import ChunkCensus, ChunkFeed, Viewpoint, chunk_snapshot, disk_params
 from beamsplat.services.mapping.config import MappingConfig
-from beamsplat.services.mapping.engines.choice import check_cuda, make_engine
+from beamsplat.services.mapping.engines.choice import OPTION, make_engine
 from beamsplat.services.mapping.intake import KeyframeIntake
 from beamsplat.services.mapping.mapper import FULL, HALF, InsertionResult, Mapper
 from beamsplat.services.mapping.messages import (
@@ -41,9 +43,9 @@ from beamsplat.services.mapping.messages import (
 )
 from beamsplat.services.mapping.preview import render_keyframe, render_view
 from beamsplat.services.mapping.queries import check_names, keyframe_id_of, view_of, viewpoint_of
+from beamsplat.services.mapping.session.budgets import check_budget, check_gpu_budget
 from beamsplat.services.mapping.session.checkpointer import CheckpointResult
 from beamsplat.services.mapping.session.live_session import LiveSession, MapSession, NoSession
-from beamsplat.services.mapping.session.paging import check_budget
 from beamsplat.services.mapping.session.state import arrays_of
 from beamsplat.services.mapping.settings import MapperSettings
 from beamsplat.services.mapping.warm import warm
@@ -77,9 +79,8 @@ class MappingNode(Node):
         """Check the engine, the memory budget, and that the folders can be written."""
         c = self.config
         if c.engine == "cuda":
-            check_cuda()
-        if c.memory_mb is not None:
-            check_budget(c.memory_mb, c.session)
+            check_cuda(OPTION)
+        self._check_budgets()
         for option, folder in (("save", c.save), ("session", c.session)):
             if folder is not None:
                 check_can_write(folder, option, read_only_disk=True)
@@ -88,11 +89,15 @@ class MappingNode(Node):
         c = self.config
         self.writes_to = c.session
         warm()
+        engine = make_engine(c.engine, c.threads, c.gpu_memory_mb)
+        self.config = c = c.for_engine(engine.identity.name)
+        assert c.max_gaussians is not None  # see `for_engine`
         settings = MapperSettings(
-            half_iterations=c.half_steps, full_iterations=c.full_steps, max_gaussians=c.gaussians(),
-            max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
+            half_iterations=c.half_steps, full_iterations=c.full_steps, stride_px=c.stride_px,
+            fine_stride_px=c.fine_stride_px, max_gaussians=c.max_gaussians, max_keyframes=c.max_keyframes,
+            refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
         )  # fmt: skip
-        self._mapper = Mapper(settings, seed=c.seed, engine=make_engine(c.engine, c.threads))
+        self._mapper = Mapper(settings, seed=c.seed, engine=engine)
         self._mapper.must_stop = self._must_pause
         self._now_ns = 0  # newest stamp that has arrived: the time of the data
         self._interruptible = self._interrupted = False  # owed steps, by the arrival of a keyframe
@@ -100,10 +105,21 @@ class MappingNode(Node):
         self._feed = ChunkFeed()
         self._viewpoint: Viewpoint | None = None  # of the newest keyframe
         self._backlog = 0  # keyframes that wait on the robot
-        if c.memory_mb is not None:
-            check_budget(c.memory_mb, c.session)
+        self._check_budgets()
         if not self.in_standby:
             self.take_over()
+
+    def _check_budgets(self) -> None:
+        c = self.config
+        if c.memory_mb is not None:
+            check_budget(c.memory_mb, c.session)
+        if c.gpu_memory_mb is not None:
+            check_gpu_budget(c.engine, c.session)
+
+    def options(self) -> MappingConfig:
+        """Return the options with the defaults of the engine that computes here."""
+        on_cpu = self.config.engine == "cpu" or cuda_obstacle() is not None
+        return self.config.for_engine("cpu" if on_cpu else "cuda")
 
     def close(self) -> None:
         self._session.close()
@@ -394,7 +410,7 @@ class MappingNode(Node):
                 self._session.finish_checkpoint(work())
         if folder is not None:
             on_disk = (part for anchor in list(m.store.paged_out) for part in disk_params(m, anchor))
-            params_map = chain([m.store.params[:, : m.store.count]], on_disk)
+            params_map = chain([m.store.rows(0, PARAMS)], on_disk)
             count = m.store.count + m.store.paged_out_count
             try:
                 write_map(folder, count, params_map, stamps_ns, T_map_body)

@@ -10,7 +10,6 @@ import numpy as np
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.scores import rgb_depth_alpha
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.mapper import HALF, Mapper
 
 _MOST_FROM_DISK = 500_000  # Gaussians read for one render: 28 MB
@@ -66,17 +65,12 @@ def render_view(mapper: Mapper, T_map_camera: np.ndarray, camera: RasterCamera |
     """
     if camera is None:
         camera = next(k.levels[HALF].camera for k in reversed(mapper.keyframes.values()))
-    params, count, left_out = mapper.store.params, mapper.store.count, 0
     parts: list[np.ndarray] = []
+    left_out = 0
     if mapper.disk_gaussians is not None:
         parts, left_out = mapper.disk_gaussians.read_visible(
             camera, T_map_camera, mapper.T_map_anchor, _MOST_FROM_DISK
         )
-    if parts:
-        whole = np.concatenate([params[:, :count], *parts], axis=1)
-        count = whole.shape[1]
-        params = np.pad(whole, ((0, 0), (0, -count % 16)))
-    # A rasterizer of its own: that of the mapper would keep buffers for the largest image ever asked for.
-    render = Rasterizer(1).render(params, count, camera, inverse(T_map_camera))
-    rgb = (np.clip(render.image[:3].transpose(1, 2, 0), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    image = mapper.engine.render_with(camera, inverse(T_map_camera), parts)
+    rgb = (np.clip(image[:3].transpose(1, 2, 0), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     return MapView(rgb, camera, left_out)

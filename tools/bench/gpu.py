@@ -215,9 +215,10 @@ def _time_ms(kernels: Kernels, work: Callable[[], object], repeats: int) -> floa
 
 def _map(data: Path, prior: str, kernels: Kernels, log: Log) -> dict[str, Any]:
     from beamsplat.services.mapping.engines.cuda import CudaEngine
+    from beamsplat.services.mapping.profiles import settings_for
     from beamsplat.tools.bench.fused_prior import FusedDepthPrior
     from beamsplat.tools.bench.mapping import MapBenchSettings, run_bench
 
-    bench = MapBenchSettings(prior=prior, refine_s=20.0, threads=2)
+    bench = MapBenchSettings(prior=prior, refine_s=20.0, threads=2, settings=settings_for("cuda"))
     field = FusedDepthPrior("stixel") if prior == "field" else None
     return run_bench(data, bench, log, None, field, engine=CudaEngine(kernels))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,8 +11,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from beamsplat.common.engines.choice import EngineName
 from beamsplat.common.errors import UserError
-from beamsplat.services.mapping.config import EngineName
 from beamsplat.tools.cli.options import writable
 
 console = Console(stderr=True)
@@ -92,19 +93,21 @@ def bench_map(
     import cv2
 
     from beamsplat.services.mapping.engines.choice import make_engine
-    from beamsplat.services.mapping.settings import MapperSettings
+    from beamsplat.services.mapping.profiles import settings_for
     from beamsplat.tools.bench.fused_prior import DynamicObjectMasks, FusedDepthPrior
     from beamsplat.tools.bench.mapping import MapBenchSettings, run_bench
 
     cv2.setNumThreads(1)
+    mapper_engine = make_engine(engine, threads)
+    settings = settings_for(mapper_engine.identity.name)
     bench = MapBenchSettings(
         prior=prior, threads=threads, seed=seed, refine_s=refine_s, count_cpu=count_cpu, jump=jump,
         settle_steps=settle_steps, distance_m=distance_m, angle_rad=angle_rad,
-        settings=MapperSettings(refine_pose=refine_pose, refine_exposure=refine_exposure),
+        settings=replace(settings, refine_pose=refine_pose, refine_exposure=refine_exposure),
     )  # fmt: skip
     field = FusedDepthPrior(source) if prior == "field" else None
     masks = DynamicObjectMasks() if movers else None
-    result = run_bench(data, bench, console.print, out, field, masks, make_engine(engine, threads))
+    result = run_bench(data, bench, console.print, out, field, masks, mapper_engine)
     if as_json:
         print(json.dumps(result))
         return
@@ -130,11 +133,11 @@ def bench_gpu(
 
         beamsplat bench gpu --out out/gpu --data recordings/house_a
     """
-    from beamsplat.services.mapping.engines.choice import check_cuda
+    from beamsplat.common.engines.choice import check_cuda
 
     if tile not in (8, 16):
         raise UserError(f"--tile {tile}: expected 8 or 16")
-    check_cuda()
+    check_cuda("mapping.engine")
     from beamsplat.common.raster.cuda.driver import CudaKernels
     from beamsplat.tools.bench.gpu import bench_gpu as run
 

@@ -18,7 +18,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.files.resources import shipped_file
 from beamsplat.tools.cli.browser import BrowserOption, open_in_browser
-from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
+from beamsplat.tools.cli.memory_option import GpuMemoryOption, MemoryOption, memory_overrides
 from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def demo(
     ] = None,
     memory: MemoryOption = None,
     browser: BrowserOption = True,
+    gpu_memory: GpuMemoryOption = None,
 ) -> None:
     """Simulate a drive through a furnished home, run the system on it live, and record it.
 
@@ -84,7 +85,7 @@ def demo(
         f"mapping.save={json.dumps(str(out / 'map'))}",
         f"mapping.session={json.dumps(str(out / 'session'))}",
         f"rate={rate}",
-        *memory_overrides(memory),
+        *memory_overrides(memory, gpu_memory),
         *(set_ or ()),
     )
     deployment = load_deployment(DEPLOYMENT, overrides)

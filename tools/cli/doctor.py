@@ -20,8 +20,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from beamsplat.common.config.deployment import Deployment, load_deployment
+from beamsplat.common.engines.choice import cuda_obstacle
 from beamsplat.common.optional_packages import remedy_for, requirements
-from beamsplat.services.mapping.engines.choice import cuda_obstacle
 
 MIN_PYTHON = (3, 11)
 MIN_SHM_MB = 256

@@ -6,6 +6,7 @@ A session has two halves: the edge half (Gaussians and keyframes) and the robot 
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -44,13 +45,16 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
 
     Example: beamsplat session info map
     """
+    from beamsplat.common.engines.protocol import identity_in
     from beamsplat.common.mapfiles.session import SessionFolder
 
     folder = SessionFolder(session)
     head, manifest = folder.header(), folder.manifest()
     edge: dict[str, Any] | None = None
+    engine = None if manifest is None else identity_in(manifest)
     if manifest is not None:
         edge = {k: manifest[k] for k in ("keyframes", "gaussians", "anchors", "steps", "stamp_ns", "bytes")}
+        edge["engine"] = None if engine is None else asdict(engine)
         edge["keyframes_on_disk"] = len(folder.keyframe_ids())
         state = folder.read_state()
         assert state is not None  # there is a manifest
@@ -69,7 +73,7 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
             f"edge half: {edge['keyframes']} keyframes, {edge['gaussians']} Gaussians on {edge['anchors']} "
             f"anchors, {edge['steps']} steps, {edge['bytes'] / 1e6:.1f} MB; {edge['keyframes_on_disk']} "
             f"keyframes on disk, {edge['keyframes_newer']} of them newer than the checkpoint; robot map "
-            f"{edge['map_uuid'] or 'without a UUID'}"
+            f"{edge['map_uuid'] or 'without a UUID'}; computed by {engine or 'an unknown engine'}"
         )
     if robot is None:
         print("robot half: none (`beamsplat session join` adds it)")

@@ -19,7 +19,7 @@ from rich.live import Live as Screen
 
 from beamsplat.common.config.deployment import Deployment, load_deployment
 from beamsplat.common.errors import UserError
-from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
+from beamsplat.tools.cli.memory_option import GpuMemoryOption, MemoryOption, memory_overrides
 from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ def run(
         float | None, typer.Option(min=0.0, help="Replay at N times real time; 0 = flat out")
     ] = None,
     memory: MemoryOption = None,
+    gpu_memory: GpuMemoryOption = None,
 ) -> None:
     """Run a deployment: a router and one supervised process per node.
 
@@ -92,9 +93,11 @@ def run(
 
         beamsplat run deploy/edge.toml --memory 1GB --set mapping.session=map
 
+        beamsplat run deploy/edge.toml --gpu-memory 2GB --set mapping.session=map
+
         beamsplat run deploy/robot.toml router localization
     """
-    deployment = _load(file, [*memory_overrides(memory), *(set_ or ())])
+    deployment = _load(file, [*memory_overrides(memory, gpu_memory), *(set_ or ())])
     if rate is not None:
         deployment = deployment.model_copy(update={"rate": rate})
     run_checked(deployment, tuple(nodes) if nodes else None).check_useful()

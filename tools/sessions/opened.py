@@ -107,7 +107,9 @@ def write_saved(folder: SessionFolder, arrays: Arrays, slam: Any = None) -> None
     with faults_explained(folder):
         if slam is not None:
             slam.save(folder.robot)
-        folder.write_state(arrays, summary_of(arrays))
+        before = folder.manifest() or {}
+        engine = {"engine": before["engine"]} if "engine" in before else {}
+        folder.write_state(arrays, {**summary_of(arrays), **engine})
         folder.remove_blocks(folder.block_numbers())  # all Gaussians are in the state now
 
 

@@ -91,8 +91,8 @@ class Commands:
     def _params(self, node: str) -> Iterator[Answer]:
         if node == ROUTER:
             raise UserError("the router has no options that can be changed while it runs")
-        config = build_node(self._supervisor.deployment, node, self._supervisor.table).config
-        options = Redactor().table(config.model_dump(mode="json"))
+        options_of_node = build_node(self._supervisor.deployment, node, self._supervisor.table).options()
+        options = Redactor().table(options_of_node.model_dump(mode="json"))
         yield Answer(stamp_ns=time.time_ns(), text=json.dumps(options, indent=2))
 
     def _check_remote(self, node: str, overrides: list[str]) -> None:

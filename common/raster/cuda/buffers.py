@@ -7,6 +7,11 @@ import torch
 from beamsplat.common.raster.cuda.source import BLOCK, BUCKET, GROUP, Kernels
 from beamsplat.common.raster.layout import CHANNELS
 
+_BY_GAUSSIAN = (
+    "records", "depth", "sorted_depth", "pair_count", "ordered_count", "pair_end", "first_pair", "order",
+    "pose_parts",
+)  # fmt: skip
+_BYTES_EACH = 48 + 6 * 4 + 8 + 1  # of these, rounded up
 _SPARE = 1.25  # capacity of pairs over the number that was needed
 
 
@@ -77,6 +82,20 @@ class RasterBuffers:
         self._wanted_pairs = -(-int(_SPARE * most) // GROUP) * GROUP
         self.fit(self.gaussians, self.tiles)
         return True
+
+    def release_tiles(self, tiles: int) -> None:
+        """Free what images of more than `tiles` tiles have needed; they allocate it again."""
+        if self.tiles > tiles:
+            self.tiles = tiles
+            self.fit(self.gaussians, tiles)
+
+    @property
+    def bytes_each(self) -> int:
+        """Memory per Gaussian, bytes."""
+        if not self.gaussians:
+            return _BYTES_EACH
+        arrays = (getattr(self, name) for name in _BY_GAUSSIAN)
+        return -(-sum(array.nbytes for array in arrays) // self.gaussians)
 
     @property
     def allocated_bytes(self) -> int:

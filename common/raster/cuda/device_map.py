@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import torch
 
@@ -70,6 +72,55 @@ class DeviceMap:
             out[:3] += (1.0 - out[4]) * np.asarray(background, np.float32)[:, None, None]
         return out
 
+    def visible(self) -> np.ndarray:
+        """Return the columns of the Gaussians that overlap the image rendered last, int32 [V] ascending.
+
+        Waits for the device.
+        """
+        overlapping = self.buffers.pair_count[: self.gaussians.count] > 0
+        return torch.nonzero(overlapping)[:, 0].to(torch.int32).cpu().numpy()
+
+    def picture_with(
+        self, camera: RasterCamera, T_camera_map: np.ndarray, more: Sequence[np.ndarray]
+    ) -> np.ndarray:
+        """Render as `picture` does, with further Gaussians float32 [14, N] each.
+
+        Neither they nor buffers for an image of this size stay.
+        """
+        count, tiles, size = self.gaussians.count, self.buffers.tiles, (camera.width_px, camera.height_px)
+        known = size in self._training or size in self._views
+        try:
+            for part in more:
+                self.gaussians.append(part)
+            return self.picture(camera, T_camera_map)
+        finally:
+            self.gaussians.truncate(count)
+            if not known:
+                self._views.pop(size, None)
+            self.buffers.release_tiles(tiles)
+
+    def fit(
+        self, camera: RasterCamera, T_camera_map: np.ndarray, loss: Callable[[np.ndarray, np.ndarray], float],
+        rates: np.ndarray | None = None,
+    ) -> tuple[float, np.ndarray]:  # fmt: skip
+        """Go back from a loss that the host computes; with `rates` [14], take a step of Adam.
+
+        Args:
+            loss: receives the image float32 [5, H, W] and fills an array of its shape with dL/d(image).
+
+        Returns:
+            The loss, and dL/d(rho, phi) float64 [6], left perturbation of T_camera_map.
+        """
+        image = self.picture(camera, T_camera_map)
+        gradient = np.empty_like(image)
+        value = loss(image, gradient)
+        view = self._view(camera.width_px, camera.height_px)
+        view.gradient.copy_(torch.from_numpy(gradient))
+        if rates is not None:
+            view.set_rates(rates)
+        view.backward(learn=rates is not None)
+        return value, view.pose_gradient().cpu().numpy()
+
     def _view(self, width_px: int, height_px: int) -> RasterView:
         size = (width_px, height_px)
         if size in self._training:
@@ -86,6 +137,17 @@ class DeviceMap:
         Waits for the device: call it once per keyframe.
         """
         return self.buffers.grow()
+
+    @property
+    def bytes_each(self) -> int:
+        """Memory of one Gaussian in all tensors and buffers, and in a tensor's copy while it grows, bytes."""
+        g = self.gaussians
+        return g.bytes_each + self.buffers.bytes_each + g.params.nbytes // g.capacity
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Memory that does not depend on the number of Gaussians, as far as it is allocated now, bytes."""
+        return self.workspace_bytes - self.buffers.bytes_each * self.buffers.gaussians
 
     @property
     def workspace_bytes(self) -> int:

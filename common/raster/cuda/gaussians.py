@@ -7,7 +7,7 @@ import torch
 
 from beamsplat.common.geometry.transforms import quat_wxyz_from_matrix
 from beamsplat.common.raster.cuda.source import BLOCK, Kernels, filled
-from beamsplat.common.raster.layout import OPACITY, PARAMS
+from beamsplat.common.raster.layout import OPACITY, PARAMS, SCALE
 
 ARRAYS = ("params", "first", "second", "steps", "carving_votes")
 
@@ -18,12 +18,14 @@ class DeviceGaussians:
     Columns 0 to count - 1 are in use. `params`, `first` and `second` are float32 [14, capacity], `steps`
     float32 [capacity], `carving_votes` int32 [capacity], with the rows of `raster.layout`. `generation`
     changes whenever the tensors are allocated anew: launches prepared before use freed memory then.
+    Tensors grow by half of their size, but beyond `limit` columns by what is needed only.
     """
 
     def __init__(self, kernels: Kernels, capacity: int = 4096) -> None:
         self._kernels = kernels
         self._count = 0
         self.generation = 0
+        self.limit: int | None = None
         self.count_on_device = torch.zeros(1, dtype=torch.int32, device=kernels.device)
         capacity = _rounded(capacity)
         self.params, self.first, self.second = (self._zeros(PARAMS, capacity) for _ in range(3))
@@ -56,7 +58,7 @@ class DeviceGaussians:
         """Append Gaussians float32 [14, M] with zero optimiser state; return their columns as a slice."""
         new = params.shape[1]
         if self._count + new > self.capacity:
-            self.resize(max(self._count + new, self.capacity + self.capacity // 2))
+            self.resize(max(self._count + new, self.bounded(self.capacity + self.capacity // 2)))
         at = slice(self._count, self._count + new)
         for name in ARRAYS[1:]:
             getattr(self, name)[..., at] = 0
@@ -65,6 +67,10 @@ class DeviceGaussians:
         )
         self._set_count(self._count + new)
         return at
+
+    def bounded(self, capacity: int) -> int:
+        """Return a capacity, reduced to `limit` if it is larger."""
+        return capacity if self.limit is None else min(capacity, self.limit)
 
     def resize(self, capacity: int) -> None:
         """Allocate tensors for `capacity` Gaussians, at least `count`; one after the other."""
@@ -91,6 +97,26 @@ class DeviceGaussians:
                 tensor[..., : len(chosen)] = tensor.index_select(tensor.ndim - 1, index)
             self._set_count(len(chosen))
         return dropped
+
+    def truncate(self, count: int) -> None:
+        """Remove all Gaussians from column `count` on."""
+        self._set_count(min(count, self._count))
+
+    def rows(self, first: int, stop: int) -> np.ndarray:
+        """Return rows of the parameters, float32 [stop - first, count]. Waits for the device."""
+        return self.params[first:stop, : self._count].cpu().numpy().copy()
+
+    def nearest_m(self, group: np.ndarray, at_map_m: np.ndarray) -> float:
+        """Return the smallest distance (m) from a point float64 [3] to the centres of `group` int [M].
+
+        It is inf without any. Waits for the device.
+        """
+        if len(group) == 0:
+            return float("inf")
+        index = torch.from_numpy(np.asarray(group, np.int64)).to(self._kernels.device)
+        means = self.params[:SCALE].index_select(1, index).double()
+        at = torch.from_numpy(np.asarray(at_map_m, np.float64)).to(self._kernels.device)
+        return float(((means - at[:, None]) ** 2).sum(0).min().sqrt())
 
     def survivors(self, votes: int, opacity_logit: float) -> np.ndarray:
         """Return bool [count]: Gaussians with fewer votes and a higher opacity. Waits for the device."""

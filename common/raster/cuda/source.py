@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import hashlib
 import math
 import re
 from dataclasses import dataclass
@@ -52,6 +53,11 @@ class KernelSource:
     text: str
     structures: dict[str, type[ctypes.Structure]]
     kernels: dict[str, tuple[str, int]]
+
+    @property
+    def revision(self) -> str:
+        """Return a digest of the text, 12 hexadecimal digits."""
+        return hashlib.sha256(self.text.encode()).hexdigest()[:12]
 
 
 class Kernels(Protocol):

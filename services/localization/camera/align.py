@@ -111,13 +111,11 @@ class Aligner:
         return to_body @ covariance @ to_body.T
 
     def _render(self, splats: SplatMap, T_camera_map: np.ndarray, level: int) -> _Rendered:
-        render = splats.render(self.cameras[level], T_camera_map)
-        alpha = render.image[4].copy()
+        image, index = splats.view(self.cameras[level], T_camera_map)
+        alpha = image[4]
         # Normalise by alpha, so that small gaps between Gaussians do not look like texture.
-        grey = np.tensordot(GREY, render.image[:3], axes=1) / np.maximum(alpha, 0.3)
-        z = np.where(alpha > 0.3, render.image[3] / np.maximum(alpha, 0.3), 0.0).astype(np.float32)
-        index = render.index.copy()
-        splats.release(render)
+        grey = np.tensordot(GREY, image[:3], axes=1) / np.maximum(alpha, 0.3)
+        z = np.where(alpha > 0.3, image[3] / np.maximum(alpha, 0.3), 0.0).astype(np.float32)
         return _Rendered(grey, z, alpha, index)
 
     def _gauss_newton(
@@ -233,20 +231,24 @@ def rasterizer_gradient(
     loss of the grey error, summed over the pixels of `target` that the map covers and that have contrast. It
     is differentiated by the backward pass of the rasterizer.
     """
-    render = splats.render(camera, found.T_camera_map)
-    alpha = np.maximum(render.image[4], 0.3)
-    grey = np.tensordot(GREY, render.image[:3], axes=1) / alpha
-    error = found.gain * grey + found.offset - target.grey
     dx, dy = target.gradient_x, target.gradient_y
-    use = (render.image[4] > settings.min_alpha) & (dx * dx + dy * dy > settings.min_gradient**2)
-    delta = np.float32(max(1.345 * 1.4826 * found.error, 0.008))
-    slope = np.where(use, np.clip(error, -delta, delta), 0.0).astype(np.float32)
-    gradient = np.zeros_like(render.image)
-    gradient[:3] = np.float32(found.gain) * GREY[:, None, None] * slope / alpha
-    gradient[4] = -np.float32(found.gain) * slope * grey / alpha
-    pose = splats.rasterizer.backward(render, gradient).pose.copy()
-    splats.release(render)
-    return pose, int(use.sum())
+    delta, used = np.float32(max(1.345 * 1.4826 * found.error, 0.008)), 0
+
+    def loss(image: np.ndarray, gradient: np.ndarray) -> float:
+        nonlocal used
+        alpha = np.maximum(image[4], 0.3)
+        grey = np.tensordot(GREY, image[:3], axes=1) / alpha
+        error = found.gain * grey + found.offset - target.grey
+        use = (image[4] > settings.min_alpha) & (dx * dx + dy * dy > settings.min_gradient**2)
+        slope = np.where(use, np.clip(error, -delta, delta), 0.0).astype(np.float32)
+        gradient[:3] = np.float32(found.gain) * GREY[:, None, None] * slope / alpha
+        gradient[3] = 0.0
+        gradient[4] = -np.float32(found.gain) * slope * grey / alpha
+        used = int(use.sum())
+        return float(np.sum(slope * (error - 0.5 * slope)))  # Huber
+
+    _, pose = splats.engine.fit(camera, found.T_camera_map, loss)
+    return pose, used
 
 
 def motion_basis(T_body_camera: np.ndarray, planar: bool) -> np.ndarray:

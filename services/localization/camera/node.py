@@ -11,6 +11,7 @@ from pydantic import Field
 
 from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.engines.choice import EngineName, check_cuda, make_splat_engine
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.messages import Correction, DepthEstimate, Image, Odometry, Rig
@@ -23,6 +24,7 @@ from beamsplat.services.localization.camera.warm import warm
 
 log = logging.getLogger("beamsplat.localization")
 
+_ENGINE_OPTION = "localization.engine"
 ARBITRARY_SCALE = "scale is arbitrary: the depth has no unit, lengths are not metres"
 
 
@@ -32,12 +34,15 @@ class CameraLocalizationConfig(NodeConfig):
     `depth = "estimate"` uses the depth maps of the depth service, in metres or in an arbitrary unit, as
     marked in its messages; "none" uses the camera alone.
     `scale_sigma` is the standard deviation of the log scale of the depth between images.
+    `engine` holds and renders the map of the tracker: "cpu" needs no torch; "auto" is the GPU if there is one
+    with a driver and torch, else the CPU.
     """
 
     depth: Literal["estimate", "none"] = "estimate"
     scale_sigma: Remote[Annotated[float, Field(ge=0.0, le=2.0)]] = 0.15
     planar: Remote[bool] = True  # the body stays level on a floor
     width_px: Annotated[int, Field(ge=64, le=1280)] = 320
+    engine: EngineName = "cpu"
 
 
 class CameraLocalization(Node):
@@ -49,6 +54,11 @@ class CameraLocalization(Node):
     # The depth service may itself use the poses of this node: do not wait for its end of stream.
     inputs = (Input("rig", "every"), Input("camera/image", "latest"), Input("depth/estimate", feedback=True))
     outputs = ("localization/odometry", "localization/correction")
+
+    def check_resources(self) -> None:
+        """Check that the engine can run here."""
+        if self.config.engine == "cuda":
+            check_cuda(_ENGINE_OPTION)
 
     def configure(self) -> None:
         cv2.setNumThreads(1)
@@ -64,7 +74,8 @@ class CameraLocalization(Node):
             lens = Pinhole.of(c)
             self._undistort = Undistorter(lens)
             settings = CameraTrackerSettings(planar=self.config.planar, width_px=self.config.width_px)
-            self._tracker = CameraTracker(self._undistort.pinhole, c.T_body_camera, settings)
+            engine = make_splat_engine(self.config.engine, _ENGINE_OPTION)
+            self._tracker = CameraTracker(self._undistort.pinhole, c.T_body_camera, settings, engine)
             # The map and odom frames are identical, because the estimate is never corrected.
             yield "localization/correction", Correction(stamp_ns=rig.stamp_ns, T_map_odom=np.eye(4))
         else:
@@ -110,11 +121,12 @@ class CameraLocalization(Node):
 
     def _set_detail(self, t: CameraTracker, result: TrackingResult) -> None:
         """Set the text of the health message of this node."""
-        parts = [f"{len(t.splats.keyframes)} keyframes, {t.splats.store.count} Gaussians", result.detail]
+        parts = [f"{len(t.splats.keyframes)} keyframes, {t.splats.count} Gaussians", result.detail]
         if t.metric is False:
             parts.append(ARBITRARY_SCALE)
         if np.isfinite(t.scale_disagreement) and abs(t.scale_disagreement) > 0.05:
             parts.append(f"new depth is {np.exp(t.scale_disagreement):.2f} times the map's")
+        parts.append(t.splats.engine.description)
         self.detail = "; ".join(text for text in parts if text)
 
 

@@ -1,21 +1,24 @@
 """The tracker's own Gaussian map: Gaussians placed on the surfaces of keyframe depth, then optimised.
 
-It serves tracking only and is separate from the map of the mapping service.
+It serves tracking only and is separate from the map of the mapping service. Which keyframes there are, and
+where Gaussians are added and removed, is decided here; an engine (common/engines) holds and renders the
+Gaussians and optimises them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
+from beamsplat.common.engines.coverage import differing_pixels
+from beamsplat.common.engines.cpu import CpuSplatEngine
+from beamsplat.common.engines.protocol import SplatEngine, SplatView
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.discs import choose_pixels, make_discs
 from beamsplat.common.raster.layout import MEAN, OPACITY, SCALE
-from beamsplat.common.raster.optimiser import GaussianArrays, learning_rates
-from beamsplat.common.raster.rasterizer import Rasterizer, Render
+from beamsplat.common.raster.optimiser import learning_rates
 from beamsplat.services.localization.camera.kernels import map_loss
 from beamsplat.services.localization.camera.settings import CameraTrackerSettings
 
@@ -36,55 +39,57 @@ class MapKeyframe:
 class SplatMap:
     """The Gaussians, and the keyframes from which they were created."""
 
-    def __init__(self, camera: RasterCamera, settings: CameraTrackerSettings) -> None:
+    def __init__(
+        self, camera: RasterCamera, settings: CameraTrackerSettings, engine: SplatEngine | None = None
+    ) -> None:
+        """`engine` must be empty; None = the CPU. It is closed with the map."""
         self.camera, self.settings = camera, settings
-        self.rasterizer = Rasterizer()
+        self.engine: SplatEngine = CpuSplatEngine() if engine is None else engine
         self.keyframes: list[MapKeyframe] = []
-        self.store = GaussianArrays(1 << 14)
         s = settings
         self._rates = learning_rates(
             s.mean_rate_m, s.log_scale_rate, s.quat_rate, s.opacity_rate, s.colour_rate
         )
-        self._gradient = np.empty((5, camera.height_px, camera.width_px), np.float32)
 
-    def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> Render:
-        """Render the map from the camera pose `T_camera_map`; pass the result to `release` after use."""
-        return self.rasterizer.render(self.store.params, self.store.count, camera, T_camera_map)
+    @property
+    def count(self) -> int:
+        """Return the number of Gaussians."""
+        return self.engine.store.count
 
-    def release(self, render: Render) -> None:
-        """Return the buffers of a render to the rasterizer."""
-        self.rasterizer.release(render)
+    def view(self, camera: RasterCamera, T_camera_map: np.ndarray) -> SplatView:
+        """Render the map from the camera pose `T_camera_map`, float64 [4, 4]."""
+        return self.engine.view(camera, T_camera_map)
+
+    def clear(self) -> None:
+        """Remove all Gaussians and keyframes."""
+        self.engine.store.keep(np.zeros(self.count, bool))
+        self.keyframes = []
 
     # --- growing -----------------------------------------------------------------------------------
 
     def add(self, frame: MapKeyframe) -> int:
         """Add a keyframe, and Gaussians where the map differs from it; return the number of new Gaussians."""
-        s = self.settings
-        render = self.render(self.camera, inverse(frame.T_map_camera))
-        missing = _unexplained(render.image, frame, s)
-        stale = self._contradicted_by(render.index.copy(), missing, frame)
-        self.release(render)
+        s, T_camera_map = self.settings, inverse(frame.T_map_camera)
+        before = self.view(self.camera, T_camera_map)
+        missing = _unexplained(before.image, frame, s)
+        stale = self._contradicted_by(before.index, missing, frame)
         if len(stale):
             self._remove(stale)
-            render = self.render(self.camera, inverse(frame.T_map_camera))
-            missing = _unexplained(render.image, frame, s)
-            self.release(render)
+            missing = _unexplained(self.view(self.camera, T_camera_map).image, frame, s)
         grey = frame.rgb.mean(axis=0)
         wanted = missing & (frame.z_m > 0.0)
         lattice = choose_pixels(wanted, grey, s.stride_px, s.fine_stride_px, s.texture)
-        room = s.max_gaussians - self.store.count
+        room = s.max_gaussians - self.count
         u, v, spacing = (column[:room] for column in lattice)
         if len(u):
             discs = make_discs(
                 u, v, spacing, frame.z_m, frame.rgb[:, v, u], self.camera, frame.T_map_camera,
                 size=s.size, flatness=s.flatness, opacity=s.opacity, least_slant=0.2,
             )  # fmt: skip
-            self.store.append(discs)
-        render = self.render(self.camera, inverse(frame.T_map_camera))
-        frame.in_view = render.index.copy()
-        self.release(render)
-        for before in self.keyframes[-1:]:
-            before.in_view = np.zeros(0, np.int32)  # not used any more
+            self.engine.store.add(discs, anchor=0)
+        frame.in_view = self.view(self.camera, T_camera_map).index
+        for previous in self.keyframes[-1:]:
+            previous.in_view = np.zeros(0, np.int32)  # not used any more
         self.keyframes.append(frame)
         if len(self.keyframes) > s.max_keyframes:
             self._drop_keyframe()
@@ -112,29 +117,29 @@ class SplatMap:
         """
         s, camera = self.settings, self.camera
         h, w = frame.z_m.shape
-        T = inverse(frame.T_map_camera)
-        points = T[:3, :3] @ self.store.params[MEAN:SCALE, index] + T[:3, 3:4]
+        T, params = inverse(frame.T_map_camera), self.engine.store.selected(index)
+        points = T[:3, :3] @ params[MEAN:SCALE] + T[:3, 3:4]
         z = np.maximum(points[2], 1e-6)
         u = np.floor(points[0] / z * camera.fx_px + camera.cx_px + 0.5).astype(np.int64)
         v = np.floor(points[1] / z * camera.fy_px + camera.cy_px + 0.5).astype(np.int64)
         inside = (points[2] > 0.05) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
-        index, z, u, v = index[inside], z[inside], u[inside], v[inside]
+        index, params, z, u, v = index[inside], params[:, inside], z[inside], u[inside], v[inside]
         surface = frame.z_m[v, u]
         known = (surface > 0.0) & (frame.weight[v, u] > s.min_depth_weight)
-        size = np.exp(self.store.params[SCALE : SCALE + 2, index].max(axis=0))
+        size = np.exp(params[SCALE : SCALE + 2].max(axis=0))
         floats = known & (z + 2.0 * size < surface * (1.0 - s.float_margin))
         on_surface = (surface > 0.0) & (np.abs(z - surface) < s.max_depth_error * surface)
         coarse = size * camera.fx_px / z > s.coarse_px
-        faint = self.store.params[OPACITY, index] < np.log(s.prune_opacity / (1.0 - s.prune_opacity))
+        faint = params[OPACITY] < np.log(s.prune_opacity / (1.0 - s.prune_opacity))
         return index[floats | faint | (on_surface & (missing[v, u] | coarse))]
 
     def _remove(self, index: np.ndarray) -> None:
         """Remove Gaussians; the others keep their order. Renumbers `in_view` of the newest keyframe."""
         if not len(index):
             return
-        keep = np.ones(self.store.count, bool)
+        keep = np.ones(self.count, bool)
         keep[index] = False
-        self.store.keep(keep)
+        self.engine.store.keep(keep)
         new_index = np.cumsum(keep, dtype=np.int32) - 1
         for frame in self.keyframes[-1:]:
             frame.in_view = new_index[frame.in_view[keep[frame.in_view]]]
@@ -148,28 +153,26 @@ class SplatMap:
             The loss, and its gradient dL/dxi [6] with respect to a left perturbation of T_camera_map.
         """
         s, pixels = self.settings, frame.z_m.size
-        render = self.render(self.camera, inverse(frame.T_map_camera))
-        loss = map_loss(
-            render.image, frame.rgb, frame.z_m, frame.weight, np.float32(1.0 / (3 * pixels)),
-            np.float32(s.depth_weight / pixels), self._gradient,
-        )  # fmt: skip
-        gradients = self.rasterizer.backward(render, self._gradient)
-        self.store.step(self.rasterizer.team, gradients, self._rates)
-        pose = gradients.pose.copy()
-        self.release(render)
-        return float(loss), pose
+
+        def loss(image: np.ndarray, gradient: np.ndarray) -> float:
+            return float(
+                map_loss(
+                    image, frame.rgb, frame.z_m, frame.weight, np.float32(1.0 / (3 * pixels)),
+                    np.float32(s.depth_weight / pixels), gradient,
+                )
+            )  # fmt: skip
+
+        return self.engine.fit(self.camera, inverse(frame.T_map_camera), loss, self._rates)
 
     def close(self) -> None:
-        """Release the rasterizer's threads and buffers."""
-        self.rasterizer.close()
+        """Close the engine."""
+        self.engine.close()
 
 
 def _unexplained(image: np.ndarray, frame: MapKeyframe, s: CameraTrackerSettings) -> np.ndarray:
     """Return bool [H, W]: pixels where the map is transparent or has another colour or depth than `frame`."""
-    alpha = image[4]
-    colour_differs = cv2.blur(np.abs(image[:3] - frame.rgb).mean(axis=0), (5, 5)) > s.max_colour_error
-    expected = image[3] / np.maximum(alpha, 1e-3)
     known = (frame.z_m > 0.0) & (frame.weight > 0.5)
-    depth_differs = (known & (np.abs(expected - frame.z_m) > s.max_depth_error * frame.z_m)).astype(np.uint8)
-    depth_differs = cv2.erode(depth_differs, np.ones((5, 5), np.uint8)) > 0
-    return (alpha < s.alpha_low) | colour_differs | depth_differs
+    return differing_pixels(
+        image, frame.rgb, frame.z_m, known, min_alpha=s.alpha_low, max_colour_error=s.max_colour_error,
+        max_depth_error=s.max_depth_error,
+    )  # fmt: skip

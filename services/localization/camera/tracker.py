@@ -14,6 +14,7 @@ from collections import deque
 
 import numpy as np
 
+from beamsplat.common.engines.protocol import SplatEngine
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse, se3_exp, se3_log, yaw_of
 from beamsplat.common.status import TrackingStatus
@@ -45,13 +46,19 @@ class CameraTracker:
     """Camera pose tracker with its own splat map; the docstring of the module shows its use."""
 
     def __init__(
-        self, camera: Pinhole, T_body_camera: np.ndarray, settings: CameraTrackerSettings | None = None
-    ) -> None:
-        """Create a tracker for undistorted images of `camera`; `T_body_camera` is float64 [4, 4]."""
+        self, camera: Pinhole, T_body_camera: np.ndarray, settings: CameraTrackerSettings | None = None,
+        engine: SplatEngine | None = None,
+    ) -> None:  # fmt: skip
+        """Create a tracker for undistorted images of `camera`.
+
+        Args:
+            T_body_camera: float64 [4, 4].
+            engine: holds and renders the map; None = the CPU. It is closed with the tracker.
+        """
         self.settings = settings or CameraTrackerSettings()
         self.shape = (camera.height_px, camera.width_px)
         self.camera = tracking_camera(camera, self.settings.width_px)
-        self.splats = SplatMap(self.camera, self.settings)
+        self.splats = SplatMap(self.camera, self.settings, engine)
         self.metric: bool | None = None  # None before the first depth
         self.scale_disagreement = float("nan")  # mean log ratio of new depth to the map's depth
         self._T_body_camera = np.asarray(T_body_camera, dtype=np.float64)
@@ -249,8 +256,8 @@ class CameraTracker:
         if self._init_rounds < INIT_ROUNDS and self._failures <= self.settings.restart_after:
             return self._refine_first_depth(tracked)
         if self._init_rounds < INIT_ROUNDS:  # lost before the initialisation was complete: start again
-            self.splats.close()
-            self.splats, self._init_rounds = SplatMap(self.camera, self.settings), 0
+            self.splats.clear()
+            self._init_rounds = 0
             return self.add_without_depth(stamp_ns)
         if not self._keyframe_is_due(tracked.alignment):
             return "no keyframe is due"
@@ -278,8 +285,7 @@ class CameraTracker:
         if (z > 0.0).mean() < 0.05:
             return "there is not enough parallax yet"
         z = dense(z, np.zeros_like(z), first.z_m.shape)
-        self.splats.close()
-        self.splats = SplatMap(self.camera, self.settings)
+        self.splats.clear()
         first.z_m = (z * (INITIAL_DEPTH / float(np.median(z)))).astype(np.float32)
         self.splats.add(first)
         self._optimise_map(self.settings.first_steps)
@@ -294,12 +300,10 @@ class CameraTracker:
 
     def _rendered_depth(self, alignment: Alignment) -> np.ndarray:
         """Return the map's depth float32 [H, W] at the aligned pose, 0 where the map is not opaque."""
-        render = self.splats.render(self.camera, alignment.T_camera_map)
-        alpha = render.image[4]
+        image, _ = self.splats.view(self.camera, alignment.T_camera_map)
+        alpha = image[4]
         known = alpha > self.settings.min_alpha
-        shown = np.where(known, render.image[3] / np.maximum(alpha, 0.1), 0.0).astype(np.float32)
-        self.splats.release(render)
-        return shown
+        return np.where(known, image[3] / np.maximum(alpha, 0.1), 0.0).astype(np.float32)
 
     def _align_scale(self, z: np.ndarray, alignment: Alignment, scale_sigma: float) -> np.ndarray:
         """Return the depth `z` float32 [H, W] scaled towards the map's depth; update `scale_disagreement`."""

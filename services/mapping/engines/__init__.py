@@ -1,1 +1,1 @@
-"""The engines of the mapper: they hold the Gaussians and do the work on every pixel and Gaussian."""
+"""The engines of the mapper: those of common/engines, with optimisation on keyframes and carving."""

@@ -1,4 +1,4 @@
-"""The engine of the CPU: compiled Numba kernels on numpy arrays."""
+"""The mapper's engine of the CPU: losses and carving as compiled Numba kernels."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from beamsplat.common.engines.cpu import CpuSplatEngine
 from beamsplat.common.geometry.transforms import inverse
-from beamsplat.common.mapfiles.store import GaussianStore
-from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.optimiser import learning_rates
-from beamsplat.common.raster.rasterizer import Rasterizer, Render
+from beamsplat.common.raster.rasterizer import Render
 from beamsplat.common.raster.ssim import SsimLoss
 from beamsplat.services.mapping.engines.protocol import OptimiserStep
 from beamsplat.services.mapping.kernels import (
@@ -29,22 +28,15 @@ from beamsplat.services.mapping.keyframe import (
 from beamsplat.services.mapping.settings import LearningRates, MapperSettings
 
 
-class CpuEngine:
-    """Implements `Engine`. The same calls give the same bits, with any number of threads."""
+class CpuEngine(CpuSplatEngine):
+    """Implements `Engine`."""
+
+    device_budget_bytes: float | None = None
 
     def __init__(self, threads: int = 1) -> None:
-        self.description = f"CPU, {threads} thread{'s' * (threads > 1)}"
-        self.store = GaussianStore()
-        self.rasterizer = Rasterizer(threads)
+        super().__init__(threads)
         self._ssim = SsimLoss()
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
-
-    def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> np.ndarray:
-        """See `Engine.render`."""
-        render = self._render(camera, T_camera_map)
-        image = render.image.copy()
-        self.rasterizer.release(render)
-        return image
 
     def optimise(
         self,
@@ -69,19 +61,12 @@ class CpuEngine:
 
     @property
     def workspace_bytes(self) -> int:
-        """See `Engine.workspace_bytes`."""
+        """See `SplatEngine.workspace_bytes`."""
         losses = sum(array.nbytes for pair in self._buffers.values() for array in pair)
-        return self.rasterizer.allocated_bytes + self._ssim.allocated_bytes + losses
+        return super().workspace_bytes + self._ssim.allocated_bytes + losses
 
     def forget(self, id: int) -> None:
         """Nothing is held of a keyframe."""
-
-    def close(self) -> None:
-        """See `Engine.close`."""
-        self.rasterizer.close()
-
-    def _render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> Render:
-        return self.rasterizer.render(self.store.params, self.store.count, camera, T_camera_map)
 
     def _step(self, step: OptimiserStep, T_map_camera: np.ndarray, s: MapperSettings) -> float:
         """Render, compute the losses, go back to the Gaussians, take a step of Adam; return the loss."""

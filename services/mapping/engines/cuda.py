@@ -1,8 +1,7 @@
-"""The engine of NVIDIA GPUs: the Gaussians, the optimiser and the losses are in device memory.
+"""The mapper's engine of NVIDIA GPUs: the Gaussians, the optimiser and the losses are in device memory.
 
 A step is one CUDA graph; the host waits once per plan. Insertion is computed on the host, from one render
-per keyframe. The same calls give the same bits on the same model of GPU, with the same torch and NVRTC; they
-differ from those of the CPU engine in the last digits.
+per keyframe.
 """
 
 from __future__ import annotations
@@ -13,56 +12,49 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
+from beamsplat.common.engines.cuda import CudaSplatEngine
+from beamsplat.common.engines.protocol import MemoryUse
 from beamsplat.common.geometry.transforms import inverse
-from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.cuda.device_map import DeviceMap
 from beamsplat.common.raster.cuda.keyframe_states import FIELDS
 from beamsplat.common.raster.cuda.source import Kernels
 from beamsplat.common.raster.cuda.target_cache import TargetCache
 from beamsplat.common.raster.cuda.targets import pack_targets
 from beamsplat.common.raster.cuda.training import StepSettings
 from beamsplat.services.mapping.engines.cpu import rate_rows
-from beamsplat.services.mapping.engines.device_store import DeviceStore
 from beamsplat.services.mapping.engines.protocol import OptimiserStep
 from beamsplat.services.mapping.keyframe import PyramidLevel, StoredKeyframe
 from beamsplat.services.mapping.settings import LearningRates, MapperSettings
 
 _BATCH = 4096  # steps between two waits for the device, at most
 _TARGETS_BYTES = 512 << 20  # of keyframes in device memory: about 200 of 640x480 px
+_TARGETS_SHARE = 0.25  # of a budget of device memory, at most, for keyframes
 
 
-class CudaEngine:
+class CudaEngine(CudaSplatEngine):
     """Implements `Engine`.
 
     Args:
         kernels: compiled for the device.
+        budget_bytes: device memory that may be used, which the pager of the session keeps; None = all.
     """
 
-    def __init__(self, kernels: Kernels) -> None:
-        self._kernels = kernels
-        self._map = DeviceMap(kernels, keyframes=_BATCH)
-        self.store = DeviceStore(self._map.gaussians)
-        self._targets = TargetCache(kernels, _TARGETS_BYTES)  # by keyframe and size
+    def __init__(self, kernels: Kernels, budget_bytes: float | None = None) -> None:
+        super().__init__(kernels, keyframes=_BATCH)
+        self.device_budget_bytes = budget_bytes
+        most = _TARGETS_BYTES if budget_bytes is None else min(_TARGETS_BYTES, _TARGETS_SHARE * budget_bytes)
+        self._targets = TargetCache(kernels, int(most))  # by keyframe and size
         # Whose targets they are: a keyframe that is read from disk again has new levels.
         self._levels: dict[tuple[int, int], weakref.ref[PyramidLevel]] = {}
         self._rates: dict[tuple[int, int], tuple[LearningRates, bool]] = {}  # set in the views, by image size
 
     @property
-    def description(self) -> str:
-        """Return the device and the memory that the map takes there."""
-        gaussians = self._map.gaussians
-        used = gaussians.bytes_each * gaussians.capacity + self._map.workspace_bytes
-        used += self._targets.held_bytes
-        return f"{self._kernels.description}, {used / 1e6:.0f} MB"
-
-    @property
-    def workspace_bytes(self) -> int:
-        """Nothing is kept in host memory."""
-        return 0
-
-    def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> np.ndarray:
-        """See `Engine.render`."""
-        return self._map.picture(camera, T_camera_map)
+    def device_memory(self) -> MemoryUse:
+        """See `SplatEngine.device_memory`. What keyframes may take is fixed, also while they take less."""
+        splats = super().device_memory
+        return MemoryUse(
+            splats.fixed_bytes + self._targets.budget_bytes, splats.bytes_each,
+            splats.used_bytes + self._targets.held_bytes,
+        )  # fmt: skip
 
     def optimise(
         self,
@@ -98,7 +90,7 @@ class CudaEngine:
             self._targets.forget(key)
 
     def close(self) -> None:
-        """See `Engine.close`."""
+        """See `SplatEngine.close`."""
         for id in {key[0] for key in self._levels}:
             self.forget(id)
 

@@ -13,8 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from beamsplat.common.mapfiles.store import GaussianStore
-from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.engines.protocol import SplatEngine
 from beamsplat.services.mapping.keyframe import PyramidLevel, StoredKeyframe
 from beamsplat.services.mapping.settings import MapperSettings
 
@@ -28,22 +27,10 @@ class OptimiserStep(NamedTuple):
     refining: bool  # with the lower step size of the centres
 
 
-class Engine(Protocol):
-    """Renders and optimises the Gaussians of `store`."""
+class Engine(SplatEngine, Protocol):
+    """Renders the Gaussians of `store`, and optimises them on keyframes."""
 
-    @property
-    def description(self) -> str:
-        """Return the device, for the status; the bits of the map depend on it."""
-        ...
-
-    @property
-    def store(self) -> GaussianStore:
-        """Return the Gaussians."""
-        ...
-
-    def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> np.ndarray:
-        """Return the map as float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha."""
-        ...
+    device_budget_bytes: float | None  # of the device's own memory; None = no limit, or there is none
 
     def optimise(
         self,
@@ -66,15 +53,6 @@ class Engine(Protocol):
         """Add 1 to the carving votes of each Gaussian in front of a trusted surface of the image."""
         ...
 
-    @property
-    def workspace_bytes(self) -> int:
-        """Return the size of the buffers for rendering and losses in host memory, in bytes."""
-        ...
-
     def forget(self, id: int) -> None:
         """Free what the engine holds of a keyframe that is no longer in memory."""
-        ...
-
-    def close(self) -> None:
-        """Free threads and device memory."""
         ...

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from beamsplat.common.engines.protocol import identity_in
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import is_disk_fault
 from beamsplat.common.mapfiles.blocks import Arrays, sync, with_blocks
@@ -42,7 +43,20 @@ class Checkpointer:
     Periods are measured with the stamps of the keyframes, so that a replay is reproducible.
     """
 
-    def __init__(self, path: Path, period_ns: int, budget_bytes: float | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        path: Path,
+        period_ns: int,
+        budget_bytes: float | None = None,
+        seed: int = 0,
+        *,
+        with_device_budget: bool = False,
+    ) -> None:
+        """Args:
+        budget_bytes: of host memory; None = no limit.
+        seed: of the pager.
+        with_device_budget: whether the mapper's engine has a budget of its device's memory.
+        """
         self.folder = SessionFolder(path)
         self._opening, self._opened = threading.Lock(), False
         self._write_fault = ""
@@ -54,7 +68,8 @@ class Checkpointer:
             self._write_fault = f"the session cannot be opened: {reason(error)}"
             log.error("%s: %s; this is tried again with each keyframe", path, self._write_fault)
         self.disk_tier = DiskTier(self.folder)
-        self._pager = None if budget_bytes is None else Pager(budget_bytes, seed, self.disk_tier)
+        paged = budget_bytes is not None or with_device_budget
+        self._pager = Pager(budget_bytes, seed, self.disk_tier) if paged else None
         self._period_ns = period_ns
         self._since_ns: int | None = None  # stamp of the last checkpoint, or of the first keyframe
         self._running = False
@@ -104,6 +119,9 @@ class Checkpointer:
         manifest = self.folder.manifest()
         assert manifest is not None  # there is a state
         self._since_ns = manifest.get("stamp_ns")
+        writer = identity_in(manifest)
+        if writer is not None and writer != mapper.engine.identity:
+            log.info("the map was computed by %s; %s continues it", writer, mapper.engine.identity)
         keyframes = len(mapper.keyframes) + len(mapper.paged_out)
         self._last = CheckpointResult(int(progress["steps"]), keyframes)
         extra = extras_of(arrays)
@@ -203,6 +221,7 @@ class Checkpointer:
         summary = {
             "keyframes": keyframes, "gaussians": mapper.store.count + self.disk_tier.count, "steps": steps,
             "anchors": len(mapper.T_map_anchor), "stamp_ns": stamp_ns,
+            "engine": asdict(mapper.engine.identity),
         }  # fmt: skip
         dropped = mapper.progress()["forgotten"]
 

@@ -20,6 +20,7 @@ from beamsplat.common.mapfiles.blocks import (
     arrays_of_blocks,
     block_file,
     blocks_of,
+    placed,
     read_block,
     write_block,
 )
@@ -27,6 +28,7 @@ from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import MEAN, QUAT, SCALE
+from beamsplat.services.mapping.session.block_cache import BlockCache
 from beamsplat.services.mapping.session.frustum import frustum_intersects
 
 log = logging.getLogger("beamsplat.mapping")
@@ -46,7 +48,10 @@ class GaussianGroup:
 
 
 class DiskTier:
-    """The blocks of one session; implements `DiskGaussians`. Files are written by `page_out` only."""
+    """The blocks of one session; implements `DiskGaussians`. Files are written by `page_out` only.
+
+    Of an engine with memory of its own, `cache` keeps the blocks paged out last in host memory too.
+    """
 
     def __init__(self, folder: SessionFolder) -> None:
         self._folder = folder
@@ -55,6 +60,7 @@ class DiskTier:
         self._stale: set[int] = set()  # files that the next checkpoint does not need
         self._next = 1
         self.lost_count = 0  # Gaussians in files that could not be read again
+        self.cache = BlockCache()
 
     @property
     def count(self) -> int:
@@ -76,6 +82,7 @@ class DiskTier:
             for group in groups:
                 arrays, number = store.columns(group.members), self._next
                 write_block(self._folder.blocks, number, arrays)
+                self.cache.put(number, arrays)
                 steps = int(arrays["steps"].sum(dtype=np.float64))
                 T = T_map_anchor[group.anchor].copy()
                 out.append(Block(number, group.anchor, len(group.members), steps, group.centre_anchor_m,
@@ -104,7 +111,7 @@ class DiskTier:
             block = self.blocks.pop(number)
             self._unsynced.discard(number)
             try:
-                arrays = read_block(self._folder.blocks, block, T_map_anchor[block.anchor])
+                arrays = self._arrays(block, T_map_anchor[block.anchor])
             except UserError as error:
                 log.warning("%d Gaussians are lost: %s", block.count, error)
                 self.lost_count += block.count
@@ -112,8 +119,20 @@ class DiskTier:
             else:
                 store.page_in(arrays, block.anchor)
                 loaded += block.count
+            self.cache.remove(number)
             self._stale.add(number)
         return loaded
+
+    def _arrays(self, block: Block, T_map_anchor: np.ndarray) -> Arrays:
+        """Return the arrays of a block at the pose of its anchor, from memory or from its file.
+
+        Raises:
+            UserError: the file is missing or altered.
+        """
+        arrays = self.cache.get(block.number)
+        if arrays is None:
+            return read_block(self._folder.blocks, block, T_map_anchor)
+        return placed(arrays, block, T_map_anchor)
 
     def read(self, anchor: int, T_map_anchor: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the Gaussians of an anchor block by block, float32 [14, N], in the map frame.
@@ -122,7 +141,7 @@ class DiskTier:
         """
         for block in [b for b in self.blocks.values() if b.anchor == anchor]:
             try:
-                yield read_block(self._folder.blocks, block, T_map_anchor)["params"]
+                yield self._arrays(block, T_map_anchor)["params"]
             except UserError as error:
                 log.warning("%d Gaussians are not shown: %s", block.count, error)
 
@@ -149,7 +168,7 @@ class DiskTier:
                 left_out += block.count
                 continue
             try:
-                parts.append(read_block(self._folder.blocks, block, T_map_anchor[block.anchor])["params"])
+                parts.append(self._arrays(block, T_map_anchor[block.anchor])["params"])
                 total += block.count
             except UserError as error:
                 log.warning("%d Gaussians are not shown: %s", block.count, error)
@@ -209,14 +228,13 @@ def groups_of(store: GaussianStore, T_map_anchor: dict[int, np.ndarray]) -> list
 
     Gaussians larger than a cell are in no group and stay in memory: they are few, and visible from far away.
     """
-    out, extent = [], np.exp(store.params[SCALE:QUAT, : store.count].max(axis=0)) * _EXTENT_SIGMA
+    out, extent = [], np.exp(store.rows(SCALE, QUAT).max(axis=0)) * _EXTENT_SIGMA
+    means = store.rows(MEAN, SCALE)
     for anchor in np.unique(store.anchor[: store.count]).tolist():
         members = np.flatnonzero((store.anchor[: store.count] == anchor) & (extent < CELL_M))
         if len(members) == 0:
             continue
-        points = transform_points(
-            inverse(T_map_anchor[anchor]), store.params[MEAN:SCALE, members].T.astype(float)
-        )
+        points = transform_points(inverse(T_map_anchor[anchor]), means[:, members].T.astype(float))
         cells = np.floor(points / CELL_M).astype(np.int64) + (1 << 20)
         keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
         order = np.argsort(keys, kind="stable")

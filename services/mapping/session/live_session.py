@@ -158,7 +158,10 @@ class LiveSession:
         budget_bytes = None if config.memory_mb is None else config.memory_mb * 1e6
         period_ns = round(config.session_every_s * 1e9)
         self._intake, self._mapper = intake, intake.mapper
-        self._checkpointer = Checkpointer(config.session, period_ns, budget_bytes, config.seed)
+        self._checkpointer = Checkpointer(
+            config.session, period_ns, budget_bytes, config.seed,
+            with_device_budget=self._mapper.engine.device_budget_bytes is not None,
+        )  # fmt: skip
         self.load_visible: LoadVisible | None = lambda keyframe: self._checkpointer.load_visible(
             self._mapper, keyframe
         )

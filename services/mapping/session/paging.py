@@ -1,5 +1,5 @@
-"""Paging: a hard budget for the memory of the mapper, independent of the length of the run and the size of
-the map.
+"""Paging: hard budgets for the memory of the mapper, independent of the length of the run and the size of
+the map: one for host memory, one for the memory of a GPU that computes the map.
 
 Keyframes that are paged out have their images on disk only. Gaussians are paged out in blocks, those farthest
 from the robot first. Invariant: all Gaussians that a keyframe in memory observes are in memory; keyframes
@@ -8,7 +8,7 @@ that observe a block being paged out are paged out with it.
 With each keyframe and tick, one paged-out keyframe that observes no block on disk is paged in. At regular
 intervals a random paged-out keyframe is paged in together with all blocks that it observes (the guest).
 Gaussians are paged out from 60 % of the free budget down to 50 %: the hysteresis avoids thrashing and bounds
-the work.
+the work. From a GPU they go to the disk, and the latest ones stay in host memory beside it.
 """
 
 from __future__ import annotations
@@ -17,48 +17,24 @@ import logging
 from collections.abc import Callable
 from dataclasses import fields, replace
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
-from beamsplat.common.errors import UserError
 from beamsplat.services.mapping.keyframe import PyramidLevel, RgbdKeyframe, StoredKeyframe, compress
 from beamsplat.services.mapping.mapper import Mapper
+from beamsplat.services.mapping.session.budgets import PAGE_OUT_ABOVE, PAGE_OUT_TO, PROCESS_MB, MemoryRoom
 from beamsplat.services.mapping.session.disk_tier import DiskTier, GaussianGroup, groups_of, spheres_of
 from beamsplat.services.mapping.session.frustum import frustum_intersects
 
 log = logging.getLogger("beamsplat.mapping")
 
-# Memory of the process that is not counted here, measured live: 270 MB at the start, then caches of the bus,
-# waiting keyframes, and memory that the allocator does not return.
-PROCESS_MB = 400.0
 _MIN_KEYFRAMES = 8  # in memory, whatever the budget: fewer do not constrain the map
-_PAGE_OUT_ABOVE, _PAGE_OUT_TO = 0.6, 0.5  # of the free budget, for Gaussians (hysteresis)
-# Where the newest keyframes observe more than the share above: page out only above this multiple of it.
-_SPARE = 1.25
-_COPIES = 2  # of each Gaussian in memory: a checkpoint is written from a copy
+_CACHE_SHARE = 0.25  # of the free budget of host memory, at most, for what was paged out from a GPU
+_CACHE_BYTES = 1e9  # the same without a budget of host memory
 _MAX_TRIED = 32  # paged-out keyframes tested per call until one can be paged in
 _GUEST_EVERY = 16  # calls between two keyframes that are paged in with the blocks they observe
 _KEYFRAME_BYTES, _ANCHOR_BYTES, _BLOCK_BYTES, _ID_BYTES = 4700, 1000, 2000, 120  # bookkeeping, measured
 _INSERTION_FACTOR = 8  # memory to insert a keyframe, as a multiple of its images
-
-
-def check_budget(memory_mb: float, session: Path | None) -> None:
-    """Check the configured memory budget, independently of the map.
-
-    Raises:
-        UserError: no session folder is configured, to which data can be paged out, or the budget is smaller
-            than the memory of the process without a map.
-    """
-    if session is None:
-        raise UserError(
-            "mapping.memory_mb: paging writes to the folder of the session; give mapping.session too"
-        )
-    if memory_mb <= PROCESS_MB:
-        raise UserError(
-            f"mapping.memory_mb = {memory_mb:g}: the process itself takes {PROCESS_MB:g} MB; give at least "
-            f"{PROCESS_MB + 100:g}"
-        )
 
 
 def image_bytes(keyframe: StoredKeyframe) -> int:
@@ -75,10 +51,12 @@ def without_images(keyframe: StoredKeyframe) -> StoredKeyframe:
 class Pager:
     """Pages keyframes and Gaussians of a mapper so that its memory use is within the budget.
 
-    It is deterministic: memory use is calculated, not measured, and random choices depend on `seed`.
+    It is deterministic: memory use is calculated, not measured, and random choices depend on `seed`. The
+    engine of the mapper says what there is of its device's memory, and its budget.
     """
 
-    def __init__(self, budget_bytes: float, seed: int, disk_tier: DiskTier) -> None:
+    def __init__(self, budget_bytes: float | None, seed: int, disk_tier: DiskTier) -> None:
+        """`budget_bytes` is of host memory; None = no limit."""
         self.lost_count = 0  # keyframes that could not be read again
         self.fault = ""  # why the budget is exceeded; "" if it is not
         self.used_bytes = 0
@@ -88,7 +66,7 @@ class Pager:
         self._calls = 0
         self._disk_fault = ""
         self._guest: int | None = None  # id of the keyframe paged in last with its blocks
-        self._needed_bytes = 0  # of Gaussians that the newest keyframes observe, at the last paging out
+        self._needed = 0  # Gaussians that the newest keyframes observe, at the last paging out
         self._block_spheres: tuple[np.ndarray, np.ndarray, np.ndarray] | None = (
             None  # cache; None = out of date
         )
@@ -133,18 +111,36 @@ class Pager:
             on_disk: returns whether the keyframe with an id is on disk; others are not paged out.
         """
         self._page_in_one(mapper, decode)
-        free = self.budget_bytes - self._fixed(mapper)
-        self._page_out_gaussians(mapper, free, on_disk)
-        self._page_out_images(mapper, free, on_disk)
+        host, rooms = self._host_room(mapper), self._rooms(mapper)
+        self._limit_cache(mapper, host)
+        self._page_out_gaussians(mapper, rooms, on_disk)
+        if host is not None:
+            self._page_out_images(mapper, host, on_disk)
         self.used_bytes = self._used(mapper)
         self._check(mapper)
-        mapper.max_in_memory = int(
-            self._max_gaussian_bytes(mapper, free) / (_COPIES * mapper.store.bytes_each)
-        )
+        mapper.max_in_memory = min(int(room.most / room.each) for room in rooms)
+        mapper.store.limit_capacity(max(mapper.max_in_memory, 0))
+
+    def _rooms(self, mapper: Mapper) -> list[MemoryRoom]:
+        """Return the memories with a budget: of the host, of the engine's device."""
+        rooms = [self._host_room(mapper), _device_room(mapper)]
+        return [room for room in rooms if room is not None]
+
+    def _host_room(self, mapper: Mapper) -> MemoryRoom | None:
+        if self.budget_bytes is None:
+            return None
+        free, store = self.budget_bytes - self._fixed(mapper), mapper.store
+        images = (_MIN_KEYFRAMES + 1) * image_bytes(mapper.keyframes[mapper.newest[-1]])
+        # A checkpoint is written from a copy.
+        return MemoryRoom(free, store.bytes_each + store.copied_bytes_each, free - images)
+
+    def _limit_cache(self, mapper: Mapper, host: MemoryRoom | None) -> None:
+        limit_bytes = _CACHE_BYTES if host is None else max(_CACHE_SHARE * host.free, 0.0)
+        self._disk_tier.cache.limit(0.0 if mapper.engine.device_memory is None else limit_bytes)
 
     def _page_in_one(self, mapper: Mapper, decode: Callable[[int], RgbdKeyframe]) -> None:
         self._calls += 1
-        crowded = self._needed_bytes > _PAGE_OUT_ABOVE * (self.budget_bytes - self._fixed(mapper))
+        crowded = any(self._needed * room.each > PAGE_OUT_ABOVE * room.free for room in self._rooms(mapper))
         guest_due = self._calls % _GUEST_EVERY == 0 and not crowded
         if self._disk_tier.blocks and mapper.paged_out and guest_due:
             ids = list(mapper.paged_out)
@@ -171,18 +167,16 @@ class Pager:
 
     def _page_out(self, mapper: Mapper, id: int) -> None:
         mapper.paged_out[id] = without_images(mapper.keyframes.pop(id))
+        mapper.engine.forget(id)
 
     # --- paging out ---
 
-    def _page_out_gaussians(self, mapper: Mapper, free: float, on_disk: Callable[[int], bool]) -> None:
-        """Page out Gaussians above their part of the budget, farthest first, and keyframes that observe them.
-
-        `free` is the budget without the memory that paging cannot free, in bytes.
-        """
-        store, each = mapper.store, _COPIES * mapper.store.bytes_each
-        if store.count * each <= max(
-            _PAGE_OUT_ABOVE * free, min(_SPARE * self._needed_bytes, self._max_gaussian_bytes(mapper, free))
-        ):
+    def _page_out_gaussians(
+        self, mapper: Mapper, rooms: list[MemoryRoom], on_disk: Callable[[int], bool]
+    ) -> None:
+        """Page out Gaussians above their part of a budget, farthest first, and who observes them."""
+        store = mapper.store
+        if not any(room.is_full(store.count, self._needed) for room in rooms):
             return
         newest = mapper.newest
         pinned = {*newest, self._guest, *(id for id in mapper.keyframes if not on_disk(id))}
@@ -192,25 +186,20 @@ class Pager:
         for id, keyframe in mapper.keyframes.items():
             if id in pinned:
                 needed |= _visible(mapper, keyframe, centres, radii)
-        self._needed_bytes = each * sum(len(group.members) for group, n in zip(groups, needed) if n)
+        self._needed = sum(len(group.members) for group, n in zip(groups, needed) if n)
         robot = mapper.T_map_camera(mapper.keyframes[newest[-1]])[:3, 3]
         distance_m = np.where(needed, -1.0, np.linalg.norm(centres - robot, axis=1))
-        left, leaving = store.count * each, []
+        left, leaving = store.count, []
         for index in np.argsort(-distance_m, kind="stable").tolist():
-            if needed[index] or left <= _PAGE_OUT_TO * free:
+            if needed[index] or all(left * room.each <= PAGE_OUT_TO * room.free for room in rooms):
                 break
             leaving.append(index)
-            left -= len(groups[index].members) * each
+            left -= len(groups[index].members)
         self._write_groups(mapper, [groups[index] for index in leaving])
         chosen = np.array(leaving, np.int64)
         for id in [id for id in mapper.keyframes if id not in pinned]:
             if _visible(mapper, mapper.keyframes[id], centres[chosen], radii[chosen]).any():
                 self._page_out(mapper, id)
-
-    def _max_gaussian_bytes(self, mapper: Mapper, free: float) -> float:
-        """Return the largest memory for Gaussians, in bytes: with the fewest possible keyframes in memory."""
-        newest = mapper.newest
-        return free - (_MIN_KEYFRAMES + 1) * image_bytes(mapper.keyframes[newest[-1]])
 
     def _write_groups(self, mapper: Mapper, groups: list[GaussianGroup]) -> None:
         self._block_spheres, self._disk_fault = None, ""
@@ -219,9 +208,9 @@ class Pager:
         except OSError as error:
             self._disk_fault = f"; Gaussians cannot be written to disk: {error.strerror}"
 
-    def _page_out_images(self, mapper: Mapper, free: float, on_disk: Callable[[int], bool]) -> None:
-        """Page out random keyframes until the images of the others fit into the budget."""
-        left = free - _COPIES * mapper.store.bytes_each * mapper.store.count
+    def _page_out_images(self, mapper: Mapper, host: MemoryRoom, on_disk: Callable[[int], bool]) -> None:
+        """Page out random keyframes until the images of the others fit into the budget of host memory."""
+        left = host.free - host.each * mapper.store.count - self._disk_tier.cache.held_bytes
         used = sum(map(image_bytes, mapper.keyframes.values()))
         pinned = {*mapper.newest, self._guest}
         idle = [id for id in mapper.keyframes if id not in pinned and on_disk(id)]
@@ -243,18 +232,23 @@ class Pager:
         return PROCESS_MB * 1e6 + mapper.workspace_bytes + insertion + kept
 
     def _used(self, mapper: Mapper) -> int:
-        gaussians = _COPIES * mapper.store.bytes_each * mapper.store.count
+        store = mapper.store
+        gaussians = (store.bytes_each + store.copied_bytes_each) * store.count
         images = sum(map(image_bytes, mapper.keyframes.values()))
-        return round(self._fixed(mapper) + gaussians + images)
+        return round(self._fixed(mapper) + gaussians + images) + self._disk_tier.cache.held_bytes
 
     def _check(self, mapper: Mapper) -> None:
         """Set `fault` if the budget is exceeded, else clear it; log a warning when it changes to a fault."""
         before, self.fault = self.fault, ""
-        if self.used_bytes > self.budget_bytes:
-            self.fault = (
-                f"what the newest keyframes observe takes {self.used_bytes / 1e6:.0f} MB, "
-                f"mapping.memory_mb is {self.budget_bytes / 1e6:.0f}{self._disk_fault}"
-            )
+        device, device_budget = mapper.engine.device_memory, mapper.engine.device_budget_bytes
+        uses = [("memory_mb", self.used_bytes, self.budget_bytes)]
+        uses += [] if device is None else [("gpu_memory_mb", device.used_bytes, device_budget)]
+        for option, used_bytes, budget_bytes in uses:
+            if budget_bytes is not None and used_bytes > budget_bytes:
+                self.fault = (
+                    f"what the newest keyframes observe takes {used_bytes / 1e6:.0f} MB, "
+                    f"mapping.{option} is {budget_bytes / 1e6:.0f}{self._disk_fault}"
+                )
         if self.fault and not before:
             log.warning("the memory budget is exceeded: %s", self.fault)
 
@@ -264,11 +258,30 @@ class Pager:
         total = mapper.store.count + self._disk_tier.count
         lost = f", {self.lost_count} keyframes lost" if self.lost_count else ""
         lost += f", {self._disk_tier.lost_count} Gaussians lost" if self._disk_tier.lost_count else ""
+        where = f"{blocks} blocks on disk only"
+        if len(self._disk_tier.cache):
+            where = f"{blocks} blocks on disk, {len(self._disk_tier.cache)} of them also in host memory"
         return (
-            f"{self._used(mapper) / 1e6:.0f} of {self.budget_bytes / 1e6:.0f} MB: in memory "
-            f"{len(mapper.keyframes)} of {keyframes} keyframes, {mapper.store.count} of {total} Gaussians; "
-            f"{blocks} blocks on disk only{lost}"
+            f"{self._budgets_text(mapper)}: in memory {len(mapper.keyframes)} of {keyframes} keyframes, "
+            f"{mapper.store.count} of {total} Gaussians; {where}{lost}"
         )
+
+    def _budgets_text(self, mapper: Mapper) -> str:
+        device, device_budget = mapper.engine.device_memory, mapper.engine.device_budget_bytes
+        texts = []
+        if self.budget_bytes is not None:
+            texts.append(f"{self._used(mapper) / 1e6:.0f} of {self.budget_bytes / 1e6:.0f} MB")
+        if device is not None and device_budget is not None:
+            texts.append(f"{device.used_bytes / 1e6:.0f} of {device_budget / 1e6:.0f} MB of the GPU")
+        return ", ".join(texts)
+
+
+def _device_room(mapper: Mapper) -> MemoryRoom | None:
+    memory, budget_bytes = mapper.engine.device_memory, mapper.engine.device_budget_bytes
+    if memory is None or budget_bytes is None:
+        return None
+    free = budget_bytes - memory.fixed_bytes
+    return MemoryRoom(free, memory.bytes_each, free)
 
 
 def _visible(

@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from beamsplat.common.engines.device_store import DeviceStore
 from beamsplat.common.geometry.transforms import inverse, make_transform, se2_to_se3, se3_exp, so3_exp
 from beamsplat.common.mapfiles.scores import psnr_db
 from beamsplat.common.mapfiles.store import GaussianStore
@@ -14,7 +15,6 @@ from beamsplat.common.raster.cuda.gaussians import DeviceGaussians
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.engines.cpu import CpuEngine
 from beamsplat.services.mapping.engines.cuda import CudaEngine
-from beamsplat.services.mapping.engines.device_store import DeviceStore
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import HALF, Mapper
 from beamsplat.services.mapping.session.state import arrays_of, restore

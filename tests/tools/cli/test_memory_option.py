@@ -20,6 +20,14 @@ def test_sizes_as_people_say_them(text, mb, tmp_path):
     assert memory_overrides(None) == ()
 
 
+def test_the_budget_of_gpu_memory_is_an_option_of_its_own(tmp_path):
+    (tmp_path / "d.toml").write_text('robot = "r"\n[nodes.mapping]\n')
+    options = load_deployment(tmp_path / "d.toml", memory_overrides("1GB", "2GB")).nodes["mapping"]
+    assert options == {"memory_mb": 1000.0, "gpu_memory_mb": 2000.0}
+    with pytest.raises(UserError, match="--gpu-memory '2': expected a number and MB or GB"):
+        memory_overrides(None, "2")
+
+
 @pytest.mark.parametrize("text", ["1000", "GB", "1 TB", "-1GB", "1.2.3GB", ""])
 def test_what_is_no_size_is_refused_with_an_example(text):
     with pytest.raises(UserError, match="for example 1GB"):
@@ -28,7 +36,6 @@ def test_what_is_no_size_is_refused_with_an_example(text):
 
 @pytest.mark.parametrize("command", ["run", "demo"])
 def test_commands_take_it(command):
-    assert (
-        "--memory"
-        in CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200", "TERM": "dumb"}).output
-    )
+    output = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200", "TERM": "dumb"}).output
+    assert "--memory" in output
+    assert "--gpu-memory" in output

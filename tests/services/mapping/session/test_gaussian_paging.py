@@ -20,9 +20,9 @@ from beamsplat.common.raster.layout import MEAN, SCALE
 from beamsplat.services.mapping.chunks import disk_params
 from beamsplat.services.mapping.keyframe import MAX_DEPTH_M, RgbdKeyframe, visible_range_m
 from beamsplat.services.mapping.preview import render_view
+from beamsplat.services.mapping.session.budgets import PROCESS_MB
 from beamsplat.services.mapping.session.disk_tier import CELL_M, groups_of, spheres_of
 from beamsplat.services.mapping.session.frustum import frustum_intersects
-from beamsplat.services.mapping.session.paging import PROCESS_MB
 from tests.services.mapping.session import gallery
 from tests.services.mapping.session.maps import SECOND, handle, insert_waiting, make_node
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from beamsplat.services.mapping.session.paging import PROCESS_MB
+from beamsplat.services.mapping.session.budgets import PROCESS_MB
 from tests.services.mapping.home_drive import home, psnr_db
 from tests.services.mapping.long_drive import lap_of, samples
 

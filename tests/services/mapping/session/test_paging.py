@@ -7,11 +7,10 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.state import keyframe_views
 from beamsplat.common.messages import Tick
+from beamsplat.services.mapping.session.budgets import PROCESS_MB, check_budget
 from beamsplat.services.mapping.session.disk_tier import DiskTier
 from beamsplat.services.mapping.session.paging import (
-    PROCESS_MB,
     Pager,
-    check_budget,
     image_bytes,
     without_images,
 )

@@ -56,8 +56,17 @@ class DeviceStore(GaussianStore):
 
     @property
     def bytes_each(self) -> int:
-        """Return the bytes of one Gaussian in host memory: those of its anchor."""
+        """See `GaussianStore.bytes_each`: those of its anchor."""
         return self.anchor.itemsize
+
+    @property
+    def copied_bytes_each(self) -> int:
+        """See `GaussianStore.copied_bytes_each`."""
+        return self.gaussians.bytes_each + self.anchor.itemsize
+
+    def limit_capacity(self, count: int) -> None:
+        """See `GaussianStore.limit_capacity`."""
+        self.gaussians.limit = count
 
     def _allocate(self, capacity: int) -> None:
         """Allocate anew: `count` Gaussians, all zero."""
@@ -80,7 +89,7 @@ class DeviceStore(GaussianStore):
 
     def resize(self, capacity: int) -> None:
         """See `GaussianArrays.resize`."""
-        self.gaussians.resize(capacity)
+        self.gaussians.resize(self.gaussians.bounded(capacity))
         self._fit_anchors()
 
     def _fit_anchors(self) -> None:
@@ -105,6 +114,33 @@ class DeviceStore(GaussianStore):
     def _transform(self, chosen: np.ndarray, T_new_old: np.ndarray) -> None:
         self.gaussians.move(chosen, T_new_old)
         self.changed()
+
+    def _copied(self, name: str) -> np.ndarray:
+        if name == "anchor":
+            return self.anchor[: self.count].copy()
+        return self.gaussians.read(names=(name,))[name]
+
+    # --- reading without a copy of everything ---
+
+    def rows(self, first: int, stop: int) -> np.ndarray:
+        """See `GaussianStore.rows`."""
+        return self.gaussians.rows(first, stop)
+
+    def selected(self, group: np.ndarray) -> np.ndarray:
+        """See `GaussianStore.selected`."""
+        return self.gaussians.read(group, ("params",))["params"]
+
+    def chunk(self, anchor: int) -> np.ndarray:
+        """See `GaussianStore.chunk`."""
+        return self.selected(np.flatnonzero(self.anchor[: self.count] == anchor))
+
+    def nearest_m(self, anchor: int, at_map_m: np.ndarray) -> float:
+        """See `GaussianStore.nearest_m`."""
+        return self.gaussians.nearest_m(np.flatnonzero(self.anchor[: self.count] == anchor), at_map_m)
+
+    def survivors(self, votes: int, opacity_logit: float) -> np.ndarray:
+        """See `GaussianStore.survivors`."""
+        return self.gaussians.survivors(votes, opacity_logit)
 
     def columns(self, group: np.ndarray) -> dict[str, np.ndarray]:
         """See `GaussianStore.columns`."""
