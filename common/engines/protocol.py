@@ -24,7 +24,7 @@ class SplatView(NamedTuple):
     """A render, and what may be seen in it."""
 
     image: np.ndarray  # float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha
-    index: np.ndarray  # int32 [V], ascending: columns of the store; no other Gaussian contributes
+    visible: np.ndarray  # int32 [V], ascending: columns of the store; no other Gaussian contributes
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ class SplatMap:
         s, T_camera_map = self.settings, inverse(frame.T_map_camera)
         before = self.view(self.camera, T_camera_map)
         missing = _unexplained(before.image, frame, s)
-        stale = self._contradicted_by(before.index, missing, frame)
+        stale = self._contradicted_by(before.visible, missing, frame)
         if len(stale):
             self._remove(stale)
             missing = _unexplained(self.view(self.camera, T_camera_map).image, frame, s)
@@ -87,7 +87,7 @@ class SplatMap:
                 size=s.size, flatness=s.flatness, opacity=s.opacity, least_slant=0.2,
             )  # fmt: skip
             self.engine.store.add(discs, anchor=0)
-        frame.in_view = self.view(self.camera, T_camera_map).index
+        frame.in_view = self.view(self.camera, T_camera_map).visible
         for previous in self.keyframes[-1:]:
             previous.in_view = np.zeros(0, np.int32)  # not used any more
         self.keyframes.append(frame)

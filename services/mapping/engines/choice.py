@@ -30,6 +30,8 @@ def make_engine(name: EngineName, threads: int, gpu_memory_mb: float | None = No
         from beamsplat.services.mapping.engines.cpu import CpuEngine
 
         log.info("the map is computed on the CPU: %s", why)
+        if gpu_memory_mb is not None:
+            log.warning("mapping.gpu_memory_mb = %g has no effect without a GPU", gpu_memory_mb)
         return CpuEngine(threads)
     from beamsplat.common.raster.cuda.driver import CudaKernels
     from beamsplat.services.mapping.engines.cuda import CudaEngine

@@ -61,3 +61,9 @@ def test_without_a_gpu_auto_is_the_cpu_and_the_status_says_so():
     node = maps.make_node(half_steps=1, full_steps=1, engine="auto")
     maps.feed(node, range(1))
     assert node.detail.endswith("; CPU, 1 thread")
+
+
+@WITHOUT_GPU
+def test_a_budget_of_gpu_memory_without_a_gpu_is_said_to_have_no_effect(caplog):
+    assert make_engine("auto", 1, 2000.0).device_budget_bytes is None
+    assert "mapping.gpu_memory_mb = 2000 has no effect without a GPU" in caplog.text
