@@ -63,7 +63,12 @@ class Deployment(Config):
     state_dir: Path | None = None
     role: Role = "whole"
     security: SecurityConfig = NO_SECURITY
+    together: tuple[Token, ...] = ()  # nodes of this host that share one process, for small robots
     nodes: dict[Token, dict[str, Any]] = Field(default_factory=dict)
+
+    def sharing(self, name: str) -> tuple[str, ...]:
+        """Return the nodes in the process of the node `name`, itself included, in the order of `together`."""
+        return self.together if name in self.together else (name,)
 
     @property
     def run_dir(self) -> Path:

@@ -54,7 +54,7 @@ class HealthReporter:
         with r.changed:
             inputs = r.mailbox.health()
         self._measure_disk()
-        steps = np.array(r.steps_ms or [0.0])
+        steps, share = np.array(r.steps_ms or [0.0]), 1.0 / r.settings.nodes_in_process
         outputs = tuple(
             OutputHealth(topic=name, sent=p.sent, bytes=p.bytes, refused=p.refused)
             for name, p in r.publications.items()
@@ -64,7 +64,8 @@ class HealthReporter:
                 stamp_ns=time.time_ns(), node=r.node.name, instance=r.settings.instance,
                 epoch=r.settings.epoch, state=r.state, inputs=inputs, outputs=outputs,
                 step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
-                rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
+                rss_mb=share * self._process.memory_info().rss / 1e6,
+                cpu_percent=share * self._process.cpu_percent(),
                 detail=without_secrets(r.detail_text())[:_DETAIL_CHARS], pid=self._process.pid,
                 rejected=r.node.rejections.report(), status=without_secrets(r.node.figures.status),
                 figures=r.node.figures.report(), clock_id=self._clock_id,

@@ -28,4 +28,5 @@ class LiveSettings:
     # Identity of this process, claimed by the supervisor (common/messages/instances.py).
     epoch: int = 1
     instance: str = field(default_factory=lambda: secrets.token_hex(8))  # 16 hex digits
+    nodes_in_process: int = 1  # each reports an equal part of the memory and CPU time of the process
     standby: bool = False  # start as the successor in a hand-over: see runtime/handover.py

@@ -297,18 +297,20 @@ class _ProcessMeter:
         memory, now = 0.0, time.monotonic()
         read_memory = now - self._memory_read_s > 1.0  # it costs milliseconds per process
         self._memory_read_s = now if read_memory else self._memory_read_s
+        seen: set[int] = set()
         for child in self._supervisor.children.values():
             try:
                 pid = child.process.pid
-                if pid is None:  # not started
+                if pid is None or pid in seen:  # not started, or shared with another node
                     continue
+                seen.add(pid)
                 process = psutil.Process(pid)
                 times = process.cpu_times()
                 if read_memory:  # PSS counts shared pages once: all processes are forked from one server
                     memory += process.memory_full_info().pss / 1e6
             except psutil.Error:
                 continue
-            self._last[child.name, pid] = times.user + times.system
+            self._last[self._supervisor.process_name(child.name), pid] = times.user + times.system
         self.peak_rss_mb = max(self.peak_rss_mb, memory)
 
     def mark(self) -> float:

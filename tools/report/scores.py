@@ -137,7 +137,7 @@ def speed_and_load(record: RunRecord, costs: RunCosts, cores: int) -> dict[str, 
         for stamp, (at_ns, _) in record.acks.items()
         if stamp in record.images
     ]
-    maps = "keyframes" in costs.cpu_s
+    maps = any("keyframes" in name.split("+") for name in costs.cpu_s)  # nodes that share a process
     return {
         "fps": through / wall_s if maps else None,
         "poses_per_s": len(record.pose_at_ns) / wall_s,

@@ -72,8 +72,8 @@ def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> d
 def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fault]:
     """Return the errors of a deployment.
 
-    They are unknown nodes, invalid options, topics with two producers, nodes without any input, and a robot
-    without uplink.
+    They are unknown nodes, invalid options, topics with two producers, nodes without any input, a robot
+    without uplink, and unknown nodes that are to share a process.
     """
     found: list[Fault] = []
     classes: dict[str, type[Node]] = {}
@@ -82,6 +82,7 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
             classes[name] = type(build_node(deployment, name, table))
         except UserError as error:
             found.append(Fault(str(error)))
+    found += [Fault(text) for text in _together_faults(deployment)]
     producers: dict[str, list[str]] = {topic: [] for topic in TOPICS}
     for name, node_class in classes.items():
         for topic in node_class.outputs:
@@ -100,6 +101,20 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
             found.append(Fault(f"nothing in this deployment feeds {name}: {', '.join(missing)}", fatal=False))
     if deployment.role == "robot" and "uplink" not in deployment.nodes:
         found.append(Fault('role = "robot" without node uplink: nothing reaches an edge server', fatal=False))
+    return found
+
+
+def _together_faults(deployment: Deployment) -> list[str]:
+    """Return the errors in the list of nodes that share a process."""
+    together, known = deployment.together, ", ".join(deployment.nodes)
+    found = [
+        f"together: the deployment has no node {name!r}; it has {known}"
+        for name in together
+        if name not in deployment.nodes
+    ]
+    found += [f"together: {name!r} is named twice" for name in set(together) if together.count(name) > 1]
+    if len(together) == 1:
+        found.append(f"together = [{together[0]!r}]: name at least two nodes, or leave it out")
     return found
 
 

@@ -8,6 +8,8 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing import connection, parent_process
 from pathlib import Path
 
@@ -70,13 +72,27 @@ def serve(
     Raises:
         UserError: an option is invalid, input data is not usable, or no router answers.
     """
-    threading.excepthook = _end_process
-    node = build_node(deployment, name, table)
-    _limit_threads(node.config.threads)
-    os.nice(node.config.nice)
+    threading.excepthook = end_process
     if around is None:
         around = surroundings(node_classes(deployment, table), name, deployment.role)
-    settings = LiveSettings(
+    settings = replace(
+        live_settings(deployment, around, identity, resume),
+        exit_when_drained=exit_when_drained,
+        standby=standby,
+    )
+    node = build_node(deployment, name, table)
+    limit_threads(node.config.threads)
+    os.nice(node.config.nice)
+    live = Live(node, settings)
+    live.install_signal_handlers()
+    live.run()
+
+
+def live_settings(
+    deployment: Deployment, around: Surroundings, identity: ProcessId, resume: bool
+) -> LiveSettings:  # fmt: skip
+    """Return the settings of a node that runs with `identity`; for the arguments see `serve`."""
+    return LiveSettings(
         robot=deployment.robot,
         endpoints=deployment.router.listen,
         run_dir=deployment.run_dir,
@@ -85,14 +101,9 @@ def serve(
         wait_for=around.wait_for,
         without_producer=around.without_producer,
         resume=resume,
-        exit_when_drained=exit_when_drained,
         epoch=identity.epoch,
         instance=identity.instance,
-        standby=standby,
     )
-    live = Live(node, settings)
-    live.install_signal_handlers()
-    live.run()
 
 
 def serve_alone(deployment: Deployment, name: str) -> None:
@@ -151,6 +162,20 @@ def child(
 
     The exit code is 2 after a UserError. For the arguments see `serve`.
     """
+
+    def run() -> None:
+        if name == "router":
+            route(deployment)
+            return
+        serve(
+            deployment, name, resume=resume, around=around, identity=identity, standby=standby, table=table
+        )  # fmt: skip
+
+    run_supervised(name, log_file, run)
+
+
+def run_supervised(name: str, log_file: Path, run: Callable[[], None]) -> None:
+    """Call `run` as the process `name` of a supervisor; see `child`."""
     # Ctrl-C in a terminal is sent to the whole process group; the supervisor stops processes in order.
     os.setpgrp()
     set_process_title(f"beamsplat:{name}")
@@ -161,18 +186,7 @@ def child(
         log.warning("%s: %s; the log of %s goes to the output of the supervisor", log_file, log_fault, name)
     try:
         with missing_packages_explained(name):
-            if name == "router":
-                route(deployment)
-            else:
-                serve(
-                    deployment,
-                    name,
-                    resume=resume,
-                    around=around,
-                    identity=identity,
-                    standby=standby,
-                    table=table,
-                )
+            run()
     except UserError as error:
         log.error("%s", error)
         sys.exit(2)
@@ -181,7 +195,7 @@ def child(
         sys.exit(1)
 
 
-def _end_process(failure: threading.ExceptHookArgs) -> None:
+def end_process(failure: threading.ExceptHookArgs) -> None:
     """Log the exception that has ended a thread, and end this process with exit code 1.
 
     A process that lacks a thread would stay active and never hear an input again. The node is not closed:
@@ -251,7 +265,7 @@ def _attend(log_file: Path) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _limit_threads(threads: int) -> None:
+def limit_threads(threads: int) -> None:
     """Set the number of threads of OpenCV and PyTorch, if they are imported already."""
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)

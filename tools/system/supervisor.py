@@ -36,6 +36,7 @@ from beamsplat.tools.system.assembly import (
 )
 from beamsplat.tools.system.log_tail import LogPosition, last_error, log_position
 from beamsplat.tools.system.node_process import CHILD_ENVIRONMENT, STOP_S, child
+from beamsplat.tools.system.shared_process import child_together
 
 log = logging.getLogger("beamsplat")
 
@@ -57,7 +58,11 @@ PRELOADED = (
 
 @dataclass
 class Child:
-    """State of one supervised process; times are `time.monotonic()` in s."""
+    """State of one supervised node, or of the router; times are `time.monotonic()` in s.
+
+    Nodes that share a process (`Deployment.together`) have the same `process`. What is done to the process is
+    decided for the first of them only.
+    """
 
     name: str
     process: BaseProcess
@@ -155,7 +160,16 @@ class Supervisor:
         nodes = [name for name in self._names if name != ROUTER]
         self._around = {name: surroundings(classes, name, self.deployment.role) for name in nodes}
         for name in sorted(nodes, key=lambda n: classes[n].is_source()):
-            self._start(name)
+            if name not in self.children:  # else started with the node whose process it shares
+                self._start(name)
+
+    def _sharing(self, name: str) -> tuple[str, ...]:
+        """Return the nodes in the process of a node, or the process itself; the first decides for all."""
+        return tuple(n for n in self.deployment.sharing(name) if n == name or n in self._names)
+
+    def process_name(self, name: str) -> str:
+        """Return the name of the process of a node: its own, or those of all nodes that share it."""
+        return "+".join(self._sharing(name))
 
     def _refuse_second_router(self) -> None:
         if ROUTER in self._names and self._router_answers():
@@ -183,15 +197,31 @@ class Supervisor:
         raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
 
     def log_file(self, name: str) -> Path:
-        """Return the path of the log file of the process called `name`."""
-        return self.log_dir / f"{name}.log"
+        """Return the path of the log file of the process of the node (or router) called `name`."""
+        return self.log_dir / f"{self.process_name(name)}.log"
 
     def last_error(self, name: str) -> str:
         """Return the last error in the log of the newest process called `name`, in one line."""
         return last_error(self.log_file(name), self._log_start.get(name))
 
     def _start(self, name: str, resume: bool = False) -> None:
-        self._set_process(name, *self._spawn(self.deployment, name, resume))
+        names = self._sharing(name)
+        if len(names) == 1:
+            self._set_process(name, *self._spawn(self.deployment, name, resume))
+            return
+        identities = {other: self._claims.claim(other) for other in names}
+        around = {other: self._around[other] for other in names}
+        log_file = self.log_file(name)
+        self._log_start.update(dict.fromkeys(names, log_position(log_file)))
+        process = self._context.Process(
+            target=child_together,
+            args=(self.deployment, around, log_file, resume, self.table, identities),
+            name=self.process_name(name),
+            daemon=False,
+        )
+        process.start()
+        for other, identity in identities.items():
+            self._set_process(other, process, identity)
 
     def _spawn(
         self, deployment: Deployment, name: str, resume: bool = False, standby: bool = False
@@ -232,6 +262,11 @@ class Supervisor:
         before = self.deployment
         if any(o.partition("=")[0].strip() == "kind" for o in overrides):  # its options differ
             before = before.model_copy(update={"nodes": {**before.nodes, name: {}}})
+        if warm and len(self._sharing(name)) > 1:
+            raise UserError(
+                f"{name} shares the process {self.process_name(name)}: --cold ends it first, and starts it "
+                "anew with the new options"
+            )
         deployment = with_overrides(before, tuple(f"{name}.{o}" for o in overrides))
         node = build_node(deployment, name, self.table)
         if not warm:
@@ -275,7 +310,7 @@ class Supervisor:
 
     def restart(self, name: str) -> None:
         """Send SIGTERM to a process; `poll` starts it again when it has ended."""
-        entry = self.children[name]
+        entry = self.children[self._sharing(name)[0]]
         if entry.process.is_alive() and entry.kill_at is None:
             entry.kill_at = time.monotonic() + STOP_S
             entry.process.terminate()
@@ -284,16 +319,19 @@ class Supervisor:
         """Detect processes that have ended, and restart those whose back-off time has passed."""
         now = time.monotonic()
         for entry in self.children.values():
+            if entry.name != self._sharing(entry.name)[0]:
+                continue
             if entry.due is not None:
                 if now >= entry.due:
-                    entry.restarts += 1
+                    for name in self._sharing(entry.name):
+                        self.children[name].restarts += 1
                     self._start(entry.name, resume=True)
             elif entry.process.is_alive():
                 if entry.kill_at is not None and now > entry.kill_at:
                     entry.process.kill()
             elif entry.kill_at is not None:
                 entry.due = now
-                self._on_event(f"{entry.name} was ended by request; starts again")
+                self._on_event(f"{self.process_name(entry.name)} was ended by request; starts again")
             elif not entry.retiring:
                 self._handle_exit(entry, now)
         self._retired = [process for process in self._retired if process.is_alive()]
@@ -331,10 +369,13 @@ class Supervisor:
 
     def _handle_failure(self, entry: Child, now: float) -> None:
         """Schedule the next start of a process that has ended with a UserError, or record an obstacle."""
-        before, entry.failed = entry.failed, self.last_error(entry.name)
-        text = f"{entry.name} cannot run: {entry.failed}"
-        name = entry.name
-        if name != ROUTER and (self._service(name).finite or (self.starting and self._is_essential(name))):
+        before, failed, names = entry.failed, self.last_error(entry.name), self._sharing(entry.name)
+        for name in names:
+            self.children[name].failed = failed
+        text = f"{self.process_name(entry.name)} cannot run: {failed}"
+        if entry.name != ROUTER and any(
+            self._service(name).finite or (self.starting and self._is_essential(name)) for name in names
+        ):
             self.obstacle = self.obstacle or text
         if now - entry.started > HEALTHY_S:
             entry.failures = 0
@@ -349,7 +390,8 @@ class Supervisor:
         if code == 2:
             self._handle_failure(entry, now)
             return
-        entry.failed = ""
+        for name in self._sharing(entry.name):
+            self.children[name].failed = ""
         if now - entry.started > HEALTHY_S:
             entry.attempts = 0
         delay = BACK_OFF_S[min(entry.attempts, len(BACK_OFF_S) - 1)]
@@ -357,9 +399,8 @@ class Supervisor:
         entry.due = now + delay
         # A drained node runs until it is stopped, so with exit code 0 another program has stopped it.
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        self._on_event(
-            f"{entry.name} died ({how}: {self.last_error(entry.name)}); starts again in {delay:g} s"
-        )
+        why = f"{how}: {self.last_error(entry.name)}"
+        self._on_event(f"{self.process_name(entry.name)} died ({why}); starts again in {delay:g} s")
 
     def stop(self) -> None:
         """Stop the nodes with SIGTERM, sources first, then the router; SIGKILL after `STOP_S`."""
