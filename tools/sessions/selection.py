@@ -35,7 +35,7 @@ def floaters(params: np.ndarray, smallest: int) -> np.ndarray:
         return np.full(params.shape[1], smallest > params.shape[1])
     means = params[MEAN:SCALE].T.astype(np.float64)
     some = means[:: -(-len(means) // 20_000)]
-    to_next_m = cKDTree(means).query(some, 2)[0][:, 1]
+    to_next_m = np.asarray(cKDTree(means).query(some, 2)[0])[:, 1]
     gap_m = max(FLOATER_GAP_M, _SPACINGS * float(np.percentile(to_next_m, 90)))
     index = np.floor(means / gap_m).astype(np.int64)
     index -= index.min(axis=0) - 1

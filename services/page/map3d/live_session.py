@@ -11,6 +11,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from http import HTTPStatus
 
 import numpy as np
@@ -18,9 +19,9 @@ import zenoh
 
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.geometry.transforms import quat_xyzw_from_matrix
-from beamsplat.common.messages import Image, MapChunk, MapPoses, MapRender, Message
+from beamsplat.common.messages import Image, MapAnchors, MapChunk, MapPoses, MapRender, Message
 from beamsplat.common.messages.header import DecodeError
-from beamsplat.common.topics import topic
+from beamsplat.common.topics import Topic, topic
 from beamsplat.common.zenoh.bus import key
 from beamsplat.common.zenoh.queries import ask
 from beamsplat.common.zenoh.receiving import receive_in_thread
@@ -30,7 +31,7 @@ from beamsplat.services.page.map3d.source import MapSource, MapUnavailable, Moun
 log = logging.getLogger(__name__)
 
 IDLE_S = 30.0  # after the last request or viewer
-_CHUNK = topic("mapping/chunk")
+_TOPICS = ("mapping/chunk", "mapping/anchors")
 _QUEUED = (
     64  # chunks on their way from the session to the map; a full ring loses the oldest, which comes again
 )
@@ -149,13 +150,15 @@ class LiveMap(MapSource):
                     self._arrived.clear()
             del subscriber
 
-    def _subscribe(self, session: zenoh.Session) -> object:
-        """Subscribe to the chunks, until the result is deleted or the session closed."""
-        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_QUEUED)
-        key_expr = key(self._robot, _CHUNK.name)
-        subscriber = declare_subscription(session, key_expr, _CHUNK, _CHUNK.delivery, channel)
-        receive_in_thread(session, f"map3d-{_CHUNK.name}", subscriber, self._handle)
-        return subscriber
+    def _subscribe(self, session: zenoh.Session) -> list[object]:
+        """Subscribe to chunks and poses of anchors, until the result is deleted or the session closed."""
+        declared: list[object] = []
+        for row in map(topic, _TOPICS):
+            channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_QUEUED)
+            subscriber = declare_subscription(session, key(self._robot, row.name), row, row.delivery, channel)
+            receive_in_thread(session, f"map3d-{row.name}", subscriber, partial(self._handle, row))
+            declared.append(subscriber)
+        return declared
 
     def _stays(self) -> bool:
         """Return whether somebody still looks; else free everything."""
@@ -221,23 +224,29 @@ class LiveMap(MapSource):
         self.map.touch()
         self._posed_revision = before + 1  # what changes meanwhile is asked for again
 
-    def _handle(self, sample: zenoh.Sample) -> None:
-        """Take a published chunk; called from a thread of the session."""
+    def _handle(self, row: Topic, sample: zenoh.Sample) -> None:
+        """Take a published chunk or the poses of anchors; called from threads of the session."""
         try:
-            envelope = decode_sample(sample, _CHUNK)
+            envelope = decode_sample(sample, row)
         except DecodeError:
             self._reject("chunks of the 3D map: not decodable")
             return
         # A new process is followed when its health has been accepted; its snapshot has what came before.
-        if envelope.header.instance == self._mapper and isinstance(envelope.message, MapChunk):
-            self._put(envelope.message)
-            self._arrived.set()
+        if envelope.header.instance != self._mapper:
+            return
+        message = envelope.message
+        if isinstance(message, MapChunk):
+            self._put(message)
+        elif isinstance(message, MapAnchors):
+            poses = dict(zip(message.anchor_ids.tolist(), message.T_map_anchor))
+            self.map.move(poses, message.pose_revision)
+        self._arrived.set()
 
     def _put(self, chunk: MapChunk) -> None:
         try:
             self.map.put(
                 chunk.anchor_id, chunk.revision, np.asarray(chunk.T_map_anchor), chunk.cell_m,
-                chunk.packed.tobytes(),
+                chunk.packed.tobytes(), chunk.pose_revision,
             )  # fmt: skip
         except ValueError:
             self._reject("chunks of the 3D map: not packed Gaussians")

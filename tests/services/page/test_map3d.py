@@ -14,7 +14,7 @@ import pytest
 
 from beamsplat.common.geometry.transforms import transform_points
 from beamsplat.common.mapfiles.scores import psnr_db
-from beamsplat.common.messages import Health, Rig
+from beamsplat.common.messages import Health, MapAnchors, Rig
 from beamsplat.common.messages.instances import process_of
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.camera import RasterCamera
@@ -227,6 +227,19 @@ def _data_of(lines, kind):
             named = line.split(b":", 1)[1].strip() == kind.encode()
         elif named and line.startswith(b"data:"):
             yield json.loads(line[5:])
+
+
+def test_a_loop_closure_moves_anchors_and_sends_no_chunk_again(endpoint, mapper, tmp_path):
+    with LivePage(endpoint, tmp_path) as page:
+        page.node.on_health(mapper.health())
+        (before,) = complete(page.address, mapper)["chunks"]
+        T = r.JUMP @ np.reshape(before["T_map_anchor"], (4, 4))
+        moved = MapAnchors(stamp_ns=1, pose_revision=10, anchor_ids=np.array([0]), T_map_anchor=T[None])
+        mapper.bus.publish("mapping/anchors").put(moved)
+        wait_until(lambda: index_of(page.address)["chunks"][0]["T_map_anchor"] != before["T_map_anchor"])
+        (after,) = index_of(page.address)["chunks"]
+        assert np.allclose(np.reshape(after["T_map_anchor"], (4, 4)), T, atol=1e-6)
+        assert (after["revision"], after["levels"][0]) == (before["revision"], before["levels"][0])
 
 
 def test_a_restarted_mapper_is_another_map(endpoint, mapper, tmp_path):

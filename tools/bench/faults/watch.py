@@ -135,7 +135,7 @@ class HostWatch:
 
     def subscribe(self, name: str, take: Callable[[zenoh.Sample], None]) -> None:
         """Call `take` with every sample on the topic `name`, from a thread."""
-        channel = zenoh.handlers.FifoChannel(_WAITING)
+        channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(_WAITING)
         subscriber = self.session.declare_subscriber(key(ROBOT_NAME, name), channel)
         self._kept.append(subscriber)
         receive_in_thread(self.session, f"watch-{name}", subscriber, take)
