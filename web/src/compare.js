@@ -43,7 +43,9 @@ export class Comparison {
     const camera = this._source.value !== "render";
     this._image.alt = camera ? "Image of the camera" : "Render by the mapper";
     const url = camera ? this._urls.camera : this._urls.render;
-    if (url) this._image.src = url;
+    if (!url) return;
+    this._say("Loading ...");
+    this._image.src = url;
   }
 
   _cut() { this._image.style.clipPath = `inset(0 0 0 ${this._slider.value}%)`; }
