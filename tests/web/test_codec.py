@@ -36,7 +36,7 @@ def test_the_viewer_decodes_what_the_mapper_packs(tmp_path):
     largest = scale.max(axis=1)
     assert (np.abs(floats[:, 4:10] - upper) / largest[:, None] ** 2).max() < 1e-5
     assert np.abs(floats[:, 10] / largest - 1.0).max() < 1e-5
-    rgba = np.ascontiguousarray(records[:, 3]).view(np.uint8).reshape(500, 4) / 255.0
+    rgba = records[:, 3].copy().view(np.uint8).reshape(500, 4) / 255.0
     assert np.abs(rgba[:, :3].T - want[COLOUR:]).max() < 1e-6
     opacity = np.clip(rgba[:, 3], 1e-3, 1.0 - 1e-3)  # the shader's limits
     assert np.abs(opacity - 1.0 / (1.0 + np.exp(-want[OPACITY]))).max() < 1e-6

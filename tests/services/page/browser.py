@@ -12,10 +12,8 @@ import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PHONE = {"width": 390, "height": 844}
-SOFTWARE_GL = [
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]  # WebGL without a GPU, for the 3D map
+# WebGL without a GPU, for the 3D map.
+SOFTWARE_GL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 DESK = {"width": 1280, "height": 1150}
 
 
