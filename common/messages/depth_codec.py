@@ -159,7 +159,7 @@ def _head(packed: np.ndarray, what: str) -> tuple[int, int, int]:
     """Return bytes per value, height and width."""
     if len(packed) < _HEAD.size:
         raise ValueError(f"{what}: {len(packed)} bytes are too few")
-    magic, itemsize, height, width = _HEAD.unpack_from(packed)
+    magic, itemsize, height, width = _HEAD.unpack_from(packed.data)
     if magic != _MAGIC:
         raise ValueError(f"{what}: the data start with {magic!r}, which is no depth map or mask")
     if not 0 < height * width <= MAX_PIXELS:
