@@ -16,7 +16,7 @@ from torch.nn import functional
 from beamsplat.services.fusion.learned_inputs import CANDIDATES, CHANNELS, LABELS, OUTPUTS
 from beamsplat.services.fusion.learned_kernels import COST_STEP, ENERGY_STEP
 
-WIDTHS = (24, 40, 64, 96, 112)  # channels at 1, 1/2, 1/4, 1/8 and 1/16 of the working size
+WIDTHS = (24, 32, 64, 96, 112)  # channels at 1, 1/2, 1/4, 1/8 and 1/16 of the working size
 _REACH = 2  # labels on each side of the median, as in `learned_kernels`
 _EMD_WEIGHT = 0.1  # of the earth mover's distance, in labels, beside the cross entropy
 
