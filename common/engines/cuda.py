@@ -24,11 +24,12 @@ class CudaSplatEngine:
     Args:
         kernels: compiled for the device.
         keyframes: number of keyframes whose corrections have room on the device.
+        degree: of the spherical harmonics of colours; 0 = none.
     """
 
-    def __init__(self, kernels: Kernels, keyframes: int = 1) -> None:
+    def __init__(self, kernels: Kernels, keyframes: int = 1, degree: int = 0) -> None:
         self._kernels = kernels
-        self._map = DeviceMap(kernels, keyframes=keyframes)
+        self._map = DeviceMap(kernels, keyframes=keyframes, degree=degree)
         self.store = DeviceStore(self._map.gaussians)
 
     @property

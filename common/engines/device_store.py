@@ -11,8 +11,6 @@ from beamsplat.common.mapfiles.store import GaussianStore, saved_name
 if TYPE_CHECKING:
     from beamsplat.common.raster.cuda.gaussians import DeviceGaussians
 
-_DEVICE = ("params", "first", "second", "steps", "carving_votes")
-
 
 class DeviceStore(GaussianStore):
     """A `GaussianStore` whose arrays are in device memory; only `anchor` is on the host.
@@ -25,7 +23,7 @@ class DeviceStore(GaussianStore):
     def __init__(self, gaussians: DeviceGaussians) -> None:
         self.gaussians = gaussians
         self._copies: dict[str, np.ndarray] = {}
-        super().__init__(gaussians.capacity)
+        super().__init__(gaussians.capacity, gaussians.degree)
 
     def changed(self) -> None:
         """Forget the copies on the host."""
@@ -48,6 +46,9 @@ class DeviceStore(GaussianStore):
     second = property(lambda self: self._copy("second"))
     steps = property(lambda self: self._copy("steps"))
     carving_votes = property(lambda self: self._copy("carving_votes"))
+    harmonics = property(lambda self: self._copy("harmonics"))
+    harmonics_first = property(lambda self: self._copy("harmonics_first"))
+    harmonics_second = property(lambda self: self._copy("harmonics_second"))
 
     @property
     def capacity(self) -> int:
@@ -62,7 +63,7 @@ class DeviceStore(GaussianStore):
     @property
     def copied_bytes_each(self) -> int:
         """See `GaussianStore.copied_bytes_each`."""
-        return self.gaussians.bytes_each + self.anchor.itemsize
+        return self.gaussians.copied_bytes_each + self.anchor.itemsize
 
     def limit_capacity(self, count: int) -> None:
         """See `GaussianStore.limit_capacity`."""
@@ -144,4 +145,4 @@ class DeviceStore(GaussianStore):
 
     def columns(self, group: np.ndarray) -> dict[str, np.ndarray]:
         """See `GaussianStore.columns`."""
-        return {saved_name(name): array for name, array in self.gaussians.read(group, _DEVICE).items()}
+        return {saved_name(name): array for name, array in self.gaussians.read(group).items()}

@@ -18,7 +18,8 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse
-from beamsplat.common.mapfiles.store import transform_with_momentum
+from beamsplat.common.harmonics.basis import degree_of, rotated, with_degree
+from beamsplat.common.mapfiles.store import HARMONIC_ARRAYS, transform_with_momentum
 
 _MAGIC = b"BSGB"
 _HEAD = struct.Struct("<4sII")  # magic, CRC-32 of all bytes after the header, length of the table of arrays
@@ -109,7 +110,8 @@ def placed(arrays: Arrays, block: Block, T_map_anchor: np.ndarray) -> Arrays:
         return arrays
     move = T_map_anchor @ inverse(block.T_map_anchor)
     params, first = transform_with_momentum(arrays["params"], arrays["first"], move)
-    return arrays | {"params": params, "first": first}
+    turned = {name: rotated(arrays[name], move[:3, :3]) for name in HARMONIC_ARRAYS[:2] if name in arrays}
+    return arrays | {"params": params, "first": first} | turned
 
 
 def _unpacked(blob: bytes) -> Arrays:
@@ -141,9 +143,19 @@ def with_blocks(folder: Path, arrays: Arrays) -> Arrays:
     for block, part in zip(blocks, read):
         part["anchor"] = np.full(block.count, block.anchor, np.int64)
     out = {key: array for key, array in arrays.items() if not key.startswith("block_")}
-    for name in read[0]:
-        out[f"store_{name}"] = np.concatenate([arrays[f"store_{name}"], *(r[name] for r in read)], axis=-1)
+    names = {key.removeprefix("store_") for key in out if key.startswith("store_")} - {"events"}
+    for name in names:
+        own = arrays[f"store_{name}"]
+        out[f"store_{name}"] = np.concatenate([own, *(_part(r, name, own) for r in read)], axis=-1)
     return out
+
+
+def _part(block: Arrays, name: str, own: np.ndarray) -> np.ndarray:
+    """Return an array of a block; harmonics, which it may lack, with as many rows as those in `own`."""
+    if name not in HARMONIC_ARRAYS:
+        return block[name]
+    none = np.zeros((0, block["params"].shape[1]), np.float32)
+    return with_degree(block.get(name, none), degree_of(len(own)))
 
 
 def sync(folder: Path, numbers: Iterable[int]) -> None:

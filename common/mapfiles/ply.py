@@ -25,18 +25,26 @@ _NORMALS = ("nx", "ny", "nz")  # always zero; some files lack them
 
 
 def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
-    """Write Gaussians float32 [14, N] in the INRIA 3DGS layout (SH degree 0), atomically."""
-    write_gaussian_parts(path, params.shape[1], [params])
+    """Write Gaussians float32 [14 + 3 K, N] in the INRIA 3DGS layout, atomically.
+
+    The rows from 14 on are spherical harmonics, see `common.harmonics`.
+    """
+    write_gaussian_parts(path, params.shape[1], [params], params.shape[0] - PARAMS)
 
 
-def write_gaussian_parts(path: Path, count: int, parts: Iterable[np.ndarray]) -> None:
-    """Write `count` Gaussians, passed in parts float32 [14, N], in the INRIA 3DGS layout, atomically.
+def write_gaussian_parts(path: Path, count: int, parts: Iterable[np.ndarray], harmonics: int = 0) -> None:
+    """Write `count` Gaussians in the INRIA 3DGS layout, atomically.
+
+    Args:
+        parts: float32 [14 + harmonics, N] each.
+        harmonics: number of rows of spherical harmonics: 0, 9, 24 or 45.
 
     Raises:
         ValueError: the parts have more or fewer Gaussians; then nothing is written.
     """
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [f"property float {name}" for name in FIELDS] + ["end_header", ""]
+    names = (*FIELDS[:9], *(f"f_rest_{k}" for k in range(harmonics)), *FIELDS[9:])
+    header += [f"property float {name}" for name in names] + ["end_header", ""]
     path, received = Path(path), 0
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
@@ -52,22 +60,26 @@ def write_gaussian_parts(path: Path, count: int, parts: Iterable[np.ndarray]) ->
 
 
 def _rows(params: np.ndarray) -> np.ndarray:
-    rows = np.zeros((params.shape[1], len(FIELDS)), "<f4")
+    rest = params.shape[0] - PARAMS
+    rows = np.zeros((params.shape[1], len(FIELDS) + rest), "<f4")
     rows[:, 0:3] = params[MEAN : MEAN + 3].T
     rows[:, 6:9] = (params[COLOUR : COLOUR + 3].T - 0.5) / SH_C0
-    rows[:, 9] = params[OPACITY]
-    rows[:, 10:13] = params[SCALE : SCALE + 3].T
+    rows[:, 9 : 9 + rest] = params[PARAMS:].T
+    shape = rows[:, 9 + rest :]
+    shape[:, 0] = params[OPACITY]
+    shape[:, 1:4] = params[SCALE : SCALE + 3].T
     quat = params[QUAT : QUAT + 4]
-    rows[:, 13:17] = (quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-12)).T
+    shape[:, 4:8] = (quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-12)).T
     return rows
 
 
 def write_map(
     folder: Path,
     count: int,
-    parts: Iterable[np.ndarray],  # float32 [14, N] each, `count` in all
+    parts: Iterable[np.ndarray],  # float32 [14 + harmonics, N] each, `count` in all
     stamps_ns: np.ndarray,  # int64 [K], rising
     T_map_body: np.ndarray,  # float64 [K, 4, 4] of the keyframes
+    harmonics: int = 0,  # rows of spherical harmonics in the parts
 ) -> None:
     """Create a folder with the Gaussians (`splats.ply`) and the keyframes' body poses (`keyframes.tum`).
 
@@ -75,7 +87,7 @@ def write_map(
         UserError: the folder cannot be created or written.
     """
     make_folder(folder)
-    write_gaussian_parts(folder / "splats.ply", count, parts)
+    write_gaussian_parts(folder / "splats.ply", count, parts, harmonics)
     write_tum(folder / "keyframes.tum", Trajectory(stamps_ns, T_map_body), "keyframes of the map, refined")
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from beamsplat.common.harmonics.basis import degree_of
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
@@ -21,7 +22,8 @@ def store_of(arrays: Arrays) -> GaussianStore:
     Raises:
         KeyError: an array is missing.
     """
-    store = GaussianStore()
+    rows = arrays["store_harmonics"].shape[0] if "store_harmonics" in arrays else 0
+    store = GaussianStore(degree=degree_of(rows))
     restore_store(store, arrays)
     return store
 

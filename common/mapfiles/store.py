@@ -9,21 +9,27 @@ from typing import Protocol
 import numpy as np
 
 from beamsplat.common.geometry.transforms import quat_wxyz_from_matrix
+from beamsplat.common.harmonics.basis import coefficients, rotated, with_degree
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.layout import MEAN, OPACITY, QUAT, SCALE
+from beamsplat.common.raster.layout import MEAN, OPACITY, PARAMS, QUAT, SCALE
 from beamsplat.common.raster.optimiser import GaussianArrays
 
 # Added to the events of each anchor when a state is restored. More than the events of one anchor between two
 # checkpoints, so that no version published since the checkpoint is used again for other data.
 _VERSION_LEAP = 1000
+# Coefficients of spherical harmonics and Adam's moments of them, float32 [3 K, N] each.
+HARMONIC_ARRAYS = ("harmonics", "harmonics_first", "harmonics_second")
 _SAVED_NAMES = {"carving_votes": "strikes"}  # attribute -> name in saved files, where they differ
 
 
 class DiskGaussians(Protocol):
     """Read access to Gaussians that are stored on disk and not in memory."""
 
-    def read(self, anchor: int, T_map_anchor: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the Gaussians of an anchor in parts, float32 [14, N] each, in the map frame."""
+    def read(self, anchor: int, T_map_anchor: np.ndarray, degree: int = 0) -> Iterator[np.ndarray]:
+        """Yield the Gaussians of an anchor in parts, float32 [14 + 3 K, N] each, in the map frame.
+
+        The rows from 14 on are spherical harmonics of the degree.
+        """
 
     def nearest_m(self, anchor: int, T_map_anchor: np.ndarray, at_map_m: np.ndarray) -> float:
         """Return a lower bound on the distance (m) from a point to the Gaussians of an anchor.
@@ -69,9 +75,18 @@ class Census:
 
 
 class GaussianStore(GaussianArrays):
-    """Gaussians with their anchors, carving votes and chunk versions."""
+    """Gaussians with their anchors, carving votes and chunk versions.
 
-    def __init__(self, capacity: int = 4096) -> None:
+    With a degree, `harmonics`, `harmonics_first` and `harmonics_second` are float32 [3 K, capacity].
+    """
+
+    harmonics: np.ndarray
+    harmonics_first: np.ndarray
+    harmonics_second: np.ndarray
+
+    def __init__(self, capacity: int = 4096, degree: int = 0) -> None:
+        """`degree` is that of the spherical harmonics of colours, see `common.harmonics`; 0 = none."""
+        self.degree = degree
         self._events: dict[int, int] = {}  # per anchor: insertions and removals so far
         self.paged_out: dict[int, tuple[int, int]] = {}  # per anchor: (Gaussians, their steps) on disk only
         super().__init__(capacity)
@@ -80,9 +95,14 @@ class GaussianStore(GaussianArrays):
         super()._allocate(capacity)
         self.anchor = np.zeros(capacity, np.int64)
         self.carving_votes = np.zeros(capacity, np.int32)  # views with a trusted surface behind the Gaussian
+        for name in self._harmonic_arrays():
+            setattr(self, name, np.zeros((3 * coefficients(self.degree), capacity), np.float32))
 
     def _arrays(self) -> list[str]:
-        return [*super()._arrays(), "anchor", "carving_votes"]
+        return [*super()._arrays(), "anchor", "carving_votes", *self._harmonic_arrays()]
+
+    def _harmonic_arrays(self) -> tuple[str, ...]:
+        return HARMONIC_ARRAYS if self.degree else ()
 
     @property
     def bytes_each(self) -> int:
@@ -124,8 +144,19 @@ class GaussianStore(GaussianArrays):
         self.count = state["params"].shape[1]
         self._allocate(-(-max(self.count, 1) // 16) * 16)
         for name in self._arrays():
-            self._write(name, slice(0, self.count), state[saved_name(name)])
+            self._write(name, slice(0, self.count), self._saved(name, state))
         self._events = {anchor: events + _VERSION_LEAP for anchor, events in state["events"].tolist()}
+
+    def _saved(self, name: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
+        """Return an array of a saved state; harmonics of another degree are completed by zeros, or reduced.
+
+        Raises:
+            KeyError: the array is missing.
+        """
+        if name not in HARMONIC_ARRAYS:
+            return arrays[saved_name(name)]
+        none = np.zeros((0, arrays["params"].shape[1]), np.float32)
+        return with_degree(arrays.get(name, none), self.degree)
 
     def add(self, params: np.ndarray, anchor: int) -> None:
         """Append Gaussians float32 [14, M], in the map frame, bound to an anchor."""
@@ -165,7 +196,7 @@ class GaussianStore(GaussianArrays):
         count = arrays["params"].shape[1]
         at = self.append(arrays["params"])
         for name in self._arrays()[1:]:
-            self._write(name, at, anchor if name == "anchor" else arrays[saved_name(name)])
+            self._write(name, at, anchor if name == "anchor" else self._saved(name, arrays))
         self.count_paged_out(anchor, -count, -_sum(arrays["steps"]))
 
     def columns(self, group: np.ndarray) -> dict[str, np.ndarray]:
@@ -207,6 +238,9 @@ class GaussianStore(GaussianArrays):
         self.params[:, chosen], self.first[:, chosen] = transform_with_momentum(
             self.params[:, chosen], self.first[:, chosen], T_new_old
         )
+        for name in self._harmonic_arrays()[:2]:
+            array = getattr(self, name)
+            array[:, chosen] = rotated(array[:, chosen], T_new_old[:3, :3])
 
     def census(self) -> Census:
         """Return which Gaussians in memory belong to which anchor, and the versions of all chunks."""
@@ -240,6 +274,12 @@ class GaussianStore(GaussianArrays):
     def rows(self, first: int, stop: int) -> np.ndarray:
         """Return the rows `first` to `stop` - 1 of the parameters, float32 [rows, count]; read-only."""
         return self.params[first:stop, : self.count]
+
+    def with_harmonics(self) -> np.ndarray:
+        """Return the parameters and below them the harmonics, float32 [14 + 3 K, count]: all of the look."""
+        if not self.degree:
+            return self.rows(0, PARAMS)
+        return np.concatenate([self.rows(0, PARAMS), self._copied("harmonics")])
 
     def selected(self, group: np.ndarray) -> np.ndarray:
         """Return a copy of the parameters of the columns `group` int [N], float32 [14, N]."""

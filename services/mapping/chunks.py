@@ -134,7 +134,10 @@ def chunk_snapshot(mapper: Mapper, viewpoint: Viewpoint | None) -> Iterator[tupl
         yield anchor, census.update(anchor, census.cell_m(anchor))
 
 
-def disk_params(mapper: Mapper, anchor: int) -> Iterator[np.ndarray]:
-    """Yield the Gaussians of an anchor that are on disk only: arrays float32 [14, N], map frame."""
+def disk_params(mapper: Mapper, anchor: int, degree: int = 0) -> Iterator[np.ndarray]:
+    """Yield the Gaussians of an anchor that are on disk only: arrays float32 [14 + 3 K, N], map frame.
+
+    The rows from 14 on are spherical harmonics of the degree.
+    """
     if mapper.disk_gaussians is not None:
-        yield from mapper.disk_gaussians.read(anchor, mapper.T_map_anchor[anchor])
+        yield from mapper.disk_gaussians.read(anchor, mapper.T_map_anchor[anchor], degree)

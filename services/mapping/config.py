@@ -39,6 +39,9 @@ class MappingConfig(NodeConfig):
     latency_s: Remote[PositiveFinite] = 1.0
     stride_px: Remote[Stride] = _CPU.stride_px  # between new Gaussians
     fine_stride_px: Remote[Stride] = _CPU.fine_stride_px  # the same where the image has texture
+    # Degree of the spherical harmonics that make colours depend on the viewing direction; 0 = none. Of the
+    # exports, only PLY has them.
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 0
     max_gaussians: Annotated[int, Field(ge=1000)] | None = None  # None: see `for_engine`
     max_keyframes: Annotated[int, Field(ge=4)] = 800
     refine_pose: Remote[bool] = True

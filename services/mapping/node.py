@@ -10,6 +10,7 @@ from itertools import chain
 from beamsplat.common.engines.choice import check_cuda, cuda_obstacle
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import check_can_write
+from beamsplat.common.harmonics.basis import coefficients
 from beamsplat.common.mapfiles.ply import write_map
 from beamsplat.common.messages import (
     Anchors,
@@ -24,7 +25,6 @@ from beamsplat.common.messages import (
     Tick,
 )
 from beamsplat.common.messages.header import Header
-from beamsplat.common.raster.layout import PARAMS
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs, StopRequested
 from beamsplat.services.mapping.chunks import ChunkCensus, ChunkFeed, Viewpoint, chunk_snapshot, disk_params
 from beamsplat.services.mapping.config import MappingConfig
@@ -89,7 +89,7 @@ class MappingNode(Node):
         c = self.config
         self.writes_to = c.session
         warm()
-        engine = make_engine(c.engine, c.threads, c.gpu_memory_mb)
+        engine = make_engine(c.engine, c.threads, c.gpu_memory_mb, c.sh_degree)
         self.config = c = c.for_engine(engine.identity.name)
         assert c.max_gaussians is not None  # see `for_engine`
         settings = MapperSettings(
@@ -409,11 +409,12 @@ class MappingNode(Node):
             else:
                 self._session.finish_checkpoint(work())
         if folder is not None:
-            on_disk = (part for anchor in list(m.store.paged_out) for part in disk_params(m, anchor))
-            params_map = chain([m.store.rows(0, PARAMS)], on_disk)
+            degree, anchors = m.store.degree, list(m.store.paged_out)
+            on_disk = (part for anchor in anchors for part in disk_params(m, anchor, degree))
+            params_map = chain([m.store.with_harmonics()], on_disk)
             count = m.store.count + m.store.paged_out_count
             try:
-                write_map(folder, count, params_map, stamps_ns, T_map_body)
+                write_map(folder, count, params_map, stamps_ns, T_map_body, 3 * coefficients(degree))
             except (OSError, UserError) as error:
                 fault = f"mapping.save = {folder}: not written ({reason(error)})"
                 if self.live_settings is None:  # lockstep: nothing else continues

@@ -18,6 +18,7 @@ class LearningRates:
     quat: float = 2e-3  # of the rotation as a unit quaternion
     opacity_logit: float = 3e-2  # of the logit of the opacity
     colour: float = 5e-3  # of the RGB colour in [0, 1]
+    harmonics: float = 2.5e-4  # of coefficients of spherical harmonics: 1/20 of `colour`, as in 3DGS
     pose_rad: float = 2e-4  # of a keyframe's rotation, with `refine_pose`
     pose_m: float = 2e-4  # of a keyframe's position, with `refine_pose`
     exposure: float = 1e-3  # of a keyframe's exposure, with `refine_exposure`

@@ -8,6 +8,7 @@ import numpy as np
 
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.warm import warm as warm_rasterizer
+from beamsplat.services.mapping.engines.cpu import CpuEngine
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
 from beamsplat.services.mapping.settings import MapperSettings
@@ -17,7 +18,7 @@ def warm() -> None:
     """Run every kernel once: map two small keyframes with all options and the service's array types."""
     warm_rasterizer()
     settings = MapperSettings(ssim_every=1, refine_pose=True, refine_exposure=True, carve_votes=1)
-    mapper = Mapper(settings)
+    mapper = Mapper(settings, engine=CpuEngine(degree=1))
     wall = RgbdKeyframe(
         id=0, rgb=np.full((48, 64, 3), 128, np.uint8), camera=RasterCamera(50.0, 50.0, 31.5, 23.5, 64, 48),
         T_anchor_camera=np.eye(4), depth_m=np.full((48, 64), 2.0, np.float32),

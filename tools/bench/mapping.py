@@ -18,7 +18,6 @@ from beamsplat.common.geometry.transforms import make_transform, so3_exp
 from beamsplat.common.mapfiles.ply import read_ply_points, write_gaussian_ply
 from beamsplat.common.mapfiles.scores import ViewScore, f_score, fused_surface, rgb_depth_alpha, score_view
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.layout import PARAMS
 from beamsplat.services.mapping.engines.protocol import Engine
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import HALF, Mapper
@@ -123,7 +122,7 @@ def run_bench(
     refined = score_map(recording, mapper, log)
     if out is not None:
         write_comparison_images(recording, mapper, out)
-        write_gaussian_ply(out / "splats.ply", mapper.store.rows(0, PARAMS))
+        write_gaussian_ply(out / "splats.ply", mapper.store.with_harmonics())
     return {
         "data": str(path), "prior": bench.prior, "threads": bench.threads, "seed": bench.seed,
         "keyframes": keyframes, "refused": refused, "data_s": recording.seconds,

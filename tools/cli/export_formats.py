@@ -49,8 +49,11 @@ def write_splats(path: Path, to: str, map_: ExportedMap, detail_m: float) -> str
     store = map_.store
     whole = store.params[:, : store.count]
     params = merge_by_cell(whole, detail_m)
-    _splat_writer(to)(path, params)
+    with_harmonics = to == "ply" and params is whole
+    _splat_writer(to)(path, store.with_harmonics() if with_harmonics else params)
     text = f"{params.shape[1]} Gaussians"
+    if store.degree and not with_harmonics:
+        text += " without their spherical harmonics (only `--to ply` in full detail has them)"
     if params is whole:
         return text
     psnr_db = _cost_db(map_, params)

@@ -8,9 +8,10 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.harmonics.basis import degree_of, with_degree
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.state import progress_of, store_of
-from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.mapfiles.store import HARMONIC_ARRAYS, GaussianStore
 from beamsplat.common.raster.layout import OPACITY
 
 _KEYFRAMES, _STORE, _TAKEN = "keyframe_", "store_", "extra_taken_"
@@ -37,6 +38,8 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
         T_a_b: pose of the frame of map b in the frame of map a, float64 [4, 4].
         offset: number that is added to the anchor ids of map b.
 
+    Spherical harmonics that only one of them has are left out.
+
     Raises:
         UserError: both maps contain the same keyframes, or an anchor id plus the offset exists in map a.
     """
@@ -54,6 +57,9 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
         "anchor_id": ids_b, "keyframe_anchor": b["keyframe_anchor"] + offset,
         "store_anchor": b["store_anchor"] + offset, "store_events": b["store_events"] + [[offset, 0]],
     }  # fmt: skip
+    if "store_harmonics" in a and "store_harmonics" in b:
+        degree = degree_of(len(a["store_harmonics"]))
+        b |= {f"{_STORE}{name}": with_degree(b[f"{_STORE}{name}"], degree) for name in HARMONIC_ARRAYS}
     out = dict(a)
     for key in a:
         if key not in b:  # written by a newer program only: the mapper has a default for it

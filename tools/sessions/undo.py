@@ -14,10 +14,12 @@ from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.numbered_state import numbered_files, packed_arrays, unpacked_arrays
 from beamsplat.common.files.persist import write_durably
 from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.harmonics.basis import rotated
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.store import transform_with_momentum
 
 _STORE, _EVENTS = "store_", "store_events"
+_HARMONICS = ("store_harmonics", "store_harmonics_first")  # of colours that depend on the view
 
 
 class RemovedGaussians:
@@ -73,6 +75,7 @@ def put_back(arrays: Arrays, saved: Arrays) -> Arrays:
         return arrays
     now = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
     params, first = saved["store_params"].copy(), saved["store_first"].copy()
+    harmonics = {key: saved[key].copy() for key in _HARMONICS if key in saved}
     for anchor, before in zip(saved["anchor_id"].tolist(), saved["anchor_T_map"]):
         rows = saved["store_anchor"] == anchor
         if not rows.any():
@@ -82,7 +85,9 @@ def put_back(arrays: Arrays, saved: Arrays) -> Arrays:
         if not np.array_equal(now[anchor], before):
             move = now[anchor] @ inverse(before)
             params[:, rows], first[:, rows] = transform_with_momentum(params[:, rows], first[:, rows], move)
-    back = saved | {"store_params": params, "store_first": first}
+            for array in harmonics.values():
+                array[:, rows] = rotated(array[:, rows], move[:3, :3])
+    back = saved | {"store_params": params, "store_first": first} | harmonics
     out = dict(arrays)
     for key in arrays:
         if _is_column(key):

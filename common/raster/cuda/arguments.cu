@@ -10,7 +10,11 @@ struct RasterArguments {
     float *steps;                      // [N] Adam steps of each Gaussian
     const int *count;                  // [1] Gaussians in use
     const float *camera;               // [24] as RasterCamera.packed
-    const float *rates;                // [16] learning rate of each row; weight and log ratio of the isotropy term
+    const float *rates;                // [17] learning rate of each row; weight and log ratio of the isotropy term;
+                                       // learning rate of harmonics
+    float *harmonics, *harmonics_first, *harmonics_second;  // [3 K, N] and moments of Adam; null = none
+    float *shown;                      // [3, N] colours as the camera sees them; rows COLOUR of params without harmonics
+    float *turned;                     // [3, N] dL/d(mean) through the direction to the camera; null = none
     float4 *records;                   // [N, 3] x y A B | C log2(opacity) r g | b z half_width half_height
     float *depth;                      // [N] optical z (m), the sort key; FAR for Gaussians without pairs
     int *pair_count;                   // [N] pairs of each Gaussian
@@ -33,6 +37,7 @@ struct RasterArguments {
     int stride, pairs, groups;
     int width, height, tiles_x, tiles;
     int learn;                         // 1 = take a step of Adam
+    int harmonic_terms;                // K: 0, 3, 8 or 15
 };
 
 struct LossArguments {

@@ -134,6 +134,20 @@ __device__ void gaussian_gradient(const RasterArguments &s, int i, const Moments
     pose_gradient(h, g, d.M, pose);
 }
 
+// Adds what the colour depends on through the direction: the centre, and the place of the camera, which a left
+// perturbation rho of the pose moves by -R^T rho.
+__device__ void add_turned(const RasterArguments &s, int i, float *G, float *pose) {
+    const float *c = s.camera;
+    float turned[3];
+    #pragma unroll
+    for (int a = 0; a < 3; ++a) {
+        turned[a] = s.turned[a * s.stride + i];
+        G[a] += turned[a];
+    }
+    #pragma unroll
+    for (int r = 0; r < 3; ++r) pose[r] += c[3 * r] * turned[0] + c[3 * r + 1] * turned[1] + c[3 * r + 2] * turned[2];
+}
+
 // One thread a Gaussian. Gaussians with no weight in the image have no gradient and take no step.
 KERNEL(256) chain(RasterArguments s) {
     __shared__ float parts[256 / 32][6];
@@ -145,6 +159,7 @@ KERNEL(256) chain(RasterArguments s) {
         const Moments m = sum_slots(s, first, min(first + n, s.pairs));
         if (m.w > 0.0f) {
             gaussian_gradient(s, i, m, G, pose);
+            if (s.harmonic_terms) add_turned(s, i, G, pose);
             if (s.learn) adam_step(s, i, G, m.w);
         }
     }

@@ -26,15 +26,16 @@ class DeviceMap:
         settings: weights and rates of the steps.
         keyframes: number of keyframes whose corrections have room in `states`.
         capacity, pairs: room for Gaussians and pairs at the start; both grow.
+        degree: of the spherical harmonics of colours; 0 = none.
     """
 
     def __init__(
         self, kernels: Kernels, settings: StepSettings | None = None, *, keyframes: int = 800,
-        capacity: int = 4096, pairs: int = 1 << 16,
+        capacity: int = 4096, pairs: int = 1 << 16, degree: int = 0,
     ) -> None:  # fmt: skip
         self.kernels = kernels
         self.settings = settings or StepSettings()
-        self.gaussians = DeviceGaussians(kernels, capacity)
+        self.gaussians = DeviceGaussians(kernels, capacity, degree)
         self.buffers = RasterBuffers(kernels, pairs)
         self.states = KeyframeStates(kernels, keyframes)
         self.losses = LossLog(kernels)
@@ -142,7 +143,8 @@ class DeviceMap:
     def bytes_each(self) -> int:
         """Memory of one Gaussian in all tensors and buffers, and in a tensor's copy while it grows, bytes."""
         g = self.gaussians
-        return g.bytes_each + self.buffers.bytes_each + g.params.nbytes // g.capacity
+        largest = max(getattr(g, name).nbytes for name in g.arrays)
+        return g.bytes_each + self.buffers.bytes_each + largest // g.capacity
 
     @property
     def fixed_bytes(self) -> int:

@@ -6,10 +6,12 @@ import numpy as np
 import torch
 
 from beamsplat.common.geometry.transforms import quat_wxyz_from_matrix
+from beamsplat.common.harmonics.basis import coefficients, rotation_of
 from beamsplat.common.raster.cuda.source import BLOCK, Kernels, filled
-from beamsplat.common.raster.layout import OPACITY, PARAMS, SCALE
+from beamsplat.common.raster.layout import COLOUR, OPACITY, PARAMS, SCALE
 
 ARRAYS = ("params", "first", "second", "steps", "carving_votes")
+HARMONICS = ("harmonics", "harmonics_first", "harmonics_second")
 
 
 class DeviceGaussians:
@@ -19,10 +21,19 @@ class DeviceGaussians:
     float32 [capacity], `carving_votes` int32 [capacity], with the rows of `raster.layout`. `generation`
     changes whenever the tensors are allocated anew: launches prepared before use freed memory then.
     Tensors grow by half of their size, but beyond `limit` columns by what is needed only.
+
+    With a degree of harmonics, `harmonics` and their moments are float32 [3 K, capacity], and `turned`
+    is a buffer float32 [3, capacity]. `shown` float32 [3, capacity] are the colours that are rendered.
     """
 
-    def __init__(self, kernels: Kernels, capacity: int = 4096) -> None:
+    harmonics: torch.Tensor | None
+    harmonics_first: torch.Tensor | None
+    harmonics_second: torch.Tensor | None
+
+    def __init__(self, kernels: Kernels, capacity: int = 4096, degree: int = 0) -> None:
         self._kernels = kernels
+        self.degree = degree
+        self.arrays = (*ARRAYS, *HARMONICS) if degree else ARRAYS
         self._count = 0
         self.generation = 0
         self.limit: int | None = None
@@ -31,6 +42,14 @@ class DeviceGaussians:
         self.params, self.first, self.second = (self._zeros(PARAMS, capacity) for _ in range(3))
         self.steps = self._zeros(capacity)
         self.carving_votes = self._zeros(capacity, dtype=torch.int32)
+        for name in HARMONICS:
+            tensor = self._zeros(3 * coefficients(degree), capacity) if degree else None
+            setattr(self, name, tensor)
+        self._allocate_shown()
+
+    def _allocate_shown(self) -> None:
+        self.turned = self._zeros(3, self.capacity) if self.degree else None
+        self.shown = self._zeros(3, self.capacity) if self.degree else self.params[COLOUR:]
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.zeros(shape, dtype=dtype, device=self._kernels.device)
@@ -52,7 +71,12 @@ class DeviceGaussians:
     @property
     def bytes_each(self) -> int:
         """Bytes of one Gaussian in all tensors."""
-        return sum(getattr(self, name).nbytes for name in ARRAYS) // self.capacity
+        return self.copied_bytes_each + (24 if self.degree else 0)  # `shown` and `turned`
+
+    @property
+    def copied_bytes_each(self) -> int:
+        """Bytes of one Gaussian in the result of `read`."""
+        return sum(getattr(self, name).nbytes for name in self.arrays) // self.capacity
 
     def append(self, params: np.ndarray) -> slice:
         """Append Gaussians float32 [14, M] with zero optimiser state; return their columns as a slice."""
@@ -60,7 +84,7 @@ class DeviceGaussians:
         if self._count + new > self.capacity:
             self.resize(max(self._count + new, self.bounded(self.capacity + self.capacity // 2)))
         at = slice(self._count, self._count + new)
-        for name in ARRAYS[1:]:
+        for name in self.arrays[1:]:
             getattr(self, name)[..., at] = 0
         self.params[:, at] = torch.from_numpy(np.ascontiguousarray(params, np.float32)).to(
             self._kernels.device
@@ -75,12 +99,13 @@ class DeviceGaussians:
     def resize(self, capacity: int) -> None:
         """Allocate tensors for `capacity` Gaussians, at least `count`; one after the other."""
         capacity = _rounded(max(capacity, self._count))
-        for name in ARRAYS:
+        for name in self.arrays:
             old = getattr(self, name)
             new = self._zeros(*old.shape[:-1], capacity, dtype=old.dtype)
             new[..., : self._count] = old[..., : self._count]
             setattr(self, name, new)
             del old
+        self._allocate_shown()
         self.generation += 1
 
     def keep(self, mask: np.ndarray) -> int:
@@ -92,7 +117,7 @@ class DeviceGaussians:
         dropped = self._count - len(chosen)
         if dropped:
             index = torch.from_numpy(chosen).to(self._kernels.device)
-            for name in ARRAYS:
+            for name in self.arrays:
                 tensor = getattr(self, name)
                 tensor[..., : len(chosen)] = tensor.index_select(tensor.ndim - 1, index)
             self._set_count(len(chosen))
@@ -124,12 +149,13 @@ class DeviceGaussians:
         return (few & (self.params[OPACITY, : self._count] > opacity_logit)).cpu().numpy()
 
     def read(
-        self, group: np.ndarray | slice | None = None, names: tuple[str, ...] = ARRAYS
+        self, group: np.ndarray | slice | None = None, names: tuple[str, ...] | None = None
     ) -> dict[str, np.ndarray]:
         """Return copies of the tensors as arrays, reduced to the columns `group` (default: those in use).
 
         Waits for the device.
         """
+        names = self.arrays if names is None else names
         columns = slice(0, self._count) if group is None else group
         if isinstance(columns, slice):
             return {name: getattr(self, name)[..., columns].cpu().numpy().copy() for name in names}
@@ -158,6 +184,15 @@ class DeviceGaussians:
             quat=quat_wxyz_from_matrix(T_new_old[:3, :3]), stride=self.capacity, count=len(group),
         )  # fmt: skip
         self._kernels.launch("move_gaussians", -(-len(group) // BLOCK), arguments)
+        if self.degree:
+            self._turn_harmonics(columns.long(), T_new_old[:3, :3])
+
+    def _turn_harmonics(self, columns: torch.Tensor, R_new_old: np.ndarray) -> None:
+        turn = torch.from_numpy(rotation_of(R_new_old, self.degree)).to(self._kernels.device, torch.float32)
+        for name in HARMONICS[:2]:
+            tensor = getattr(self, name)
+            blocks = tensor[:, columns].reshape(3, len(turn), -1)
+            tensor[:, columns] = (turn @ blocks).reshape(len(tensor), -1)
 
     def vote_carving(
         self,

@@ -127,13 +127,12 @@ KERNEL(256) project(RasterArguments s) {
         const float half_width = sqrtf(fmaxf(reach * h.a, 0.0f)), half_height = sqrtf(fmaxf(reach * h.d, 0.0f));
         const float u = h.xc * h.inverse_z * c[12] + c[14], v = h.yc * h.inverse_z * c[13] + c[15];
         const float4 r0 = make_float4(u, v, h.d * k * (-0.5f * LOG2_E), h.b * k * LOG2_E);
-        const float4 r1 = make_float4(h.a * k * (-0.5f * LOG2_E), log_opacity, p[COLOUR * s.stride],
-                                      p[(COLOUR + 1) * s.stride]);
+        const float4 r1 = make_float4(h.a * k * (-0.5f * LOG2_E), log_opacity, s.shown[i], s.shown[s.stride + i]);
         n = list_tiles(s, r0, r1, half_width, half_height, 0, 0, i);
         if (n) {
             s.records[3 * i] = r0;
             s.records[3 * i + 1] = r1;
-            s.records[3 * i + 2] = make_float4(p[(COLOUR + 2) * s.stride], h.zc, half_width, half_height);
+            s.records[3 * i + 2] = make_float4(s.shown[2 * s.stride + i], h.zc, half_width, half_height);
         }
     }
     s.pair_count[i] = n;

@@ -17,9 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from beamsplat.common.harmonics.basis import C1, C2, C3
 from beamsplat.common.raster import layout, optimiser, ssim
 
-FILES = ("arguments", "project", "raster", "chain", "losses", "mapping")
+FILES = ("arguments", "project", "raster", "chain", "harmonics", "losses", "mapping")
 BUCKET = (
     32  # pairs of one warp of the backward pass; the forward pass keeps the pixel states before each bucket
 )
@@ -106,6 +107,8 @@ def _constants(tile: int) -> dict[str, float]:
         "ADAM_1": 1.0 - optimiser.BETA_1, "ADAM_2": 1.0 - optimiser.BETA_2, "EPSILON": optimiser.EPSILON,
         "LN_BETA_1": math.log(optimiser.BETA_1), "LN_BETA_2": math.log(optimiser.BETA_2),
         "SSIM_C1": ssim.C1, "SSIM_C2": ssim.C2,
+        "SH_1": C1, **{f"SH_2{k}": value for k, value in enumerate(C2)},
+        **{f"SH_3{k}": value for k, value in enumerate(C3)},
         **{f"LUMA_{channel}": float(weight) for channel, weight in zip("RGB", ssim.LUMA)},
     }  # fmt: skip
 

@@ -100,12 +100,14 @@ class TrainingView(RasterView):
         self._targets = self._zeros(pixel_bytes(width_px, height_px) + _BEAM_BYTES, dtype=torch.uint8)
         self._graphs: dict[bool, tuple[Any, Any]] = {}
 
-    def set_learning_rates(self, rates: np.ndarray) -> None:
-        """Set the learning rate of each parameter row, float32 [14] (see `optimiser.learning_rates`)."""
+    def set_learning_rates(self, rates: np.ndarray, harmonics: float = 0.0) -> None:
+        """Set the learning rate of each parameter row, float32 [14] (see `optimiser.learning_rates`).
+
+        `harmonics` is that of spherical harmonics.
+        """
         s = self.settings
-        self.set_rates(
-            rates, s.isotropy_weight / (self.width_px * self.height_px), math.log(s.isotropy_ratio)
-        )
+        isotropy = s.isotropy_weight / (self.width_px * self.height_px)
+        self.set_rates(rates, isotropy, math.log(s.isotropy_ratio), harmonics)
 
     def load(self, targets: torch.Tensor) -> None:
         """Set the targets of the next steps, uint8 [bytes] as `pack_targets` arranges them, on any device.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from beamsplat.common.harmonics.basis import coefficients
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.cuda.buffers import RasterBuffers
 from beamsplat.common.raster.cuda.gaussians import DeviceGaussians
@@ -48,7 +49,8 @@ class RasterView:
         image: float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha; the result of `forward`.
         gradient: float32 [5, H, W], dL/d(image), the input of `backward`.
         rows: float32 [16, capacity], gradients with the rows of `raster.layout`; None if not wanted.
-        rates: float32 [16], learning rate of each parameter row, weight and log ratio of the isotropy term.
+        rates: float32 [17], learning rate of each parameter row, weight and log ratio of the isotropy term,
+            learning rate of harmonics.
     """
 
     def __init__(
@@ -64,7 +66,7 @@ class RasterView:
         self._kernels, self._gaussians, self._buffers = kernels, gaussians, buffers
         self._with_rows = with_rows
         self.rows: torch.Tensor | None = None
-        self.camera, self.rates = self._zeros(CAMERA), self._zeros(PARAMS + 2)
+        self.camera, self.rates = self._zeros(CAMERA), self._zeros(PARAMS + 3)
         self.image = self._zeros(CHANNELS, height_px, width_px)
         self.gradient = self._zeros(CHANNELS, height_px, width_px)
         self._tile_used = self._zeros(self.tiles, dtype=torch.int32)
@@ -101,6 +103,9 @@ class RasterView:
         )  # fmt: skip
         return {
             **{name: getattr(b, name) for name in shared},
+            "harmonics": g.harmonics, "harmonics_first": g.harmonics_first,
+            "harmonics_second": g.harmonics_second, "shown": g.shown, "turned": g.turned,
+            "harmonic_terms": coefficients(g.degree),
             "params": g.params, "first": g.first, "second": g.second, "steps": g.steps,
             "count": g.count_on_device, "stride": g.capacity, "camera": self.camera, "rates": self.rates,
             "tile_start": self._tile_start, "group_start": self._group_start, "tile_used": self._tile_used,
@@ -118,15 +123,22 @@ class RasterView:
             raise ValueError(f"the camera is not of {self.width_px}x{self.height_px} px: {camera}")
         self.camera.copy_(torch.from_numpy(camera.packed(T_camera_map)))
 
-    def set_rates(self, rates: np.ndarray, isotropy: float = 0.0, ratio_log: float = 0.0) -> None:
-        """Set learning rates [14] and isotropy term of `backward(learn=True)`, see `optimiser.adam`."""
-        values = np.append(rates, (isotropy, ratio_log)).astype(np.float32)
+    def set_rates(
+        self, rates: np.ndarray, isotropy: float = 0.0, ratio_log: float = 0.0, harmonics: float = 0.0
+    ) -> None:
+        """Set learning rates [14] and isotropy term of `backward(learn=True)`, see `optimiser.adam`.
+
+        `harmonics` is the learning rate of spherical harmonics.
+        """
+        values = np.append(rates, (isotropy, ratio_log, harmonics)).astype(np.float32)
         self.rates.copy_(torch.from_numpy(values))
 
     def forward(self) -> torch.Tensor:
         """Render the Gaussians with `camera`; return `image`."""
         b, launch, arguments = self._buffers, self._kernels.launch, self._ready()
         blocks = b.gaussians // BLOCK
+        if self._gaussians.degree:
+            launch("shade", blocks, arguments)
         launch("project", blocks, arguments)
         torch.sort(b.depth, stable=True, out=(b.sorted_depth, b.order))
         torch.index_select(b.pair_count, 0, b.order, out=b.ordered_count)
@@ -149,6 +161,8 @@ class RasterView:
         arguments = self._ready()
         arguments.learn = int(learn)
         self._kernels.launch("backward", self._buffers.groups, arguments)
+        if self._gaussians.degree:
+            self._kernels.launch("shade_backward", self._buffers.gaussians // BLOCK, arguments)
         self._kernels.launch("chain", self._buffers.gaussians // BLOCK, arguments)
 
     def pose_gradient(self) -> torch.Tensor:

@@ -33,8 +33,8 @@ class CpuEngine(CpuSplatEngine):
 
     device_budget_bytes: float | None = None
 
-    def __init__(self, threads: int = 1) -> None:
-        super().__init__(threads)
+    def __init__(self, threads: int = 1, degree: int = 0) -> None:
+        super().__init__(threads, degree)
         self._ssim = SsimLoss()
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
@@ -76,6 +76,7 @@ class CpuEngine(CpuSplatEngine):
             level = with_hidden(level, render.image, keyframe.exposure)
         loss, gradient = self._loss(render, level, keyframe, s, step.with_ssim)
         gradients = self.rasterizer.backward(render, gradient)
+        self._harmonics_backward(gradients, inverse(T_map_camera), s.rates.harmonics)
         pixels = level.camera.width_px * level.camera.height_px
         self.store.step(
             self.rasterizer.team, gradients, rate_rows(s.rates, step.refining),

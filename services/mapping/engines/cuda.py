@@ -36,10 +36,11 @@ class CudaEngine(CudaSplatEngine):
     Args:
         kernels: compiled for the device.
         budget_bytes: device memory that may be used, which the pager of the session keeps; None = all.
+        degree: of the spherical harmonics of colours; 0 = none.
     """
 
-    def __init__(self, kernels: Kernels, budget_bytes: float | None = None) -> None:
-        super().__init__(kernels, keyframes=_BATCH)
+    def __init__(self, kernels: Kernels, budget_bytes: float | None = None, degree: int = 0) -> None:
+        super().__init__(kernels, keyframes=_BATCH, degree=degree)
         self.device_budget_bytes = budget_bytes
         most = _TARGETS_BYTES if budget_bytes is None else min(_TARGETS_BYTES, _TARGETS_SHARE * budget_bytes)
         self._targets = TargetCache(kernels, int(most))  # by keyframe and size
@@ -143,7 +144,7 @@ class CudaEngine(CudaSplatEngine):
         size = level.camera.width_px, level.camera.height_px
         view = self._map.training_view(*size)
         if self._rates.get(size) != (settings.rates, step.refining):
-            view.set_learning_rates(rate_rows(settings.rates, step.refining))
+            view.set_learning_rates(rate_rows(settings.rates, step.refining), settings.rates.harmonics)
             self._rates[size] = settings.rates, step.refining
         view.load(targets)
         view.begin(level.camera, T_map_anchor[keyframe.anchor] @ keyframe.T_anchor_camera, row)

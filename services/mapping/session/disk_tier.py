@@ -14,6 +14,7 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.common.harmonics.basis import with_degree
 from beamsplat.common.mapfiles.blocks import (
     Arrays,
     Block,
@@ -134,14 +135,13 @@ class DiskTier:
             return read_block(self._folder.blocks, block, T_map_anchor)
         return placed(arrays, block, T_map_anchor)
 
-    def read(self, anchor: int, T_map_anchor: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the Gaussians of an anchor block by block, float32 [14, N], in the map frame.
-
-        A block that cannot be read is logged and left out.
-        """
+    def read(self, anchor: int, T_map_anchor: np.ndarray, degree: int = 0) -> Iterator[np.ndarray]:
+        """See `DiskGaussians.read`; a block that cannot be read is logged and left out."""
         for block in [b for b in self.blocks.values() if b.anchor == anchor]:
             try:
-                yield self._arrays(block, T_map_anchor)["params"]
+                arrays = self._arrays(block, T_map_anchor)
+                none = np.zeros((0, block.count), np.float32)
+                yield np.concatenate([arrays["params"], with_degree(arrays.get("harmonics", none), degree)])
             except UserError as error:
                 log.warning("%d Gaussians are not shown: %s", block.count, error)
 

@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse, se2_to_se3
@@ -452,3 +453,25 @@ def test_groups_contain_all_gaussians_of_a_cell_and_their_spheres_the_rendered_e
         )
         assert off.max() <= radius + 1e-4
         assert np.ptp(store.params[MEAN:SCALE, group.members], axis=1).max() <= CELL_M + 1e-4
+
+
+def test_spherical_harmonics_leave_and_return_with_their_gaussians(tmp_path):
+    out = tmp_path / "out"
+    node = walk(make(tmp_path / "s", sh_degree=1, save=out, session_every_s=1e6), range(20))
+    mapper, tier = node._mapper, node._session._checkpointer.disk_tier
+    total = mapper.store.count + tier.count
+    assert tier.count > 0
+    list(node.drain())
+    node.close()
+    vertices = PlyData.read(out / "splats.ply")["vertex"]
+    assert vertices.count == total
+    assert np.abs(vertices["f_rest_8"]).max() > 0.0
+    store = store_of(SessionFolder(tmp_path / "s").read_state())
+    assert (store.degree, store.count) == (1, total)
+    np.testing.assert_array_equal(np.sort(vertices["f_rest_2"]), np.sort(store.harmonics[2, :total]))
+    plain = make(tmp_path / "s", sh_degree=0)  # whoever continues it without harmonics leaves them out
+    assert plain._mapper.store.count + plain._session._checkpointer.disk_tier.count == total
+    walk(plain, [20])
+    list(plain.drain())
+    plain.close()
+    assert store_of(SessionFolder(tmp_path / "s").read_state()).degree == 0

@@ -31,9 +31,11 @@ def compute_on(monkeypatch):
     """Let mapping nodes compute on "cpu", or on "cuda" by the CPU build of its kernels."""
 
     def choose(name):
-        def make(_, threads, gpu_memory_mb):
+        def make(_, threads, gpu_memory_mb, sh_degree):
             budget = None if gpu_memory_mb is None else gpu_memory_mb * 1e6
-            return CpuEngine(threads) if name == "cpu" else CudaEngine(shim_kernels(), budget)
+            if name == "cpu":
+                return CpuEngine(threads, sh_degree)
+            return CudaEngine(shim_kernels(), budget, sh_degree)
 
         monkeypatch.setattr(node_module, "make_engine", make)
 
