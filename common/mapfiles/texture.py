@@ -56,8 +56,8 @@ def choose_views(
         rows = np.flatnonzero(new > score[np.arange(len(new)), worst])
         best[rows, worst[rows]], score[rows, worst[rows]] = number, new[rows]
     neighbours = _neighbours(mesh.faces)
-    view = _smooth(best, score, neighbours)
-    return ViewChoice(view, _patches(view, neighbours))
+    chosen = _smooth(best, score, neighbours)
+    return ViewChoice(chosen, _patches(chosen, neighbours))
 
 
 def project(points_map_m: np.ndarray, camera: RasterCamera, T_map_camera: np.ndarray) -> np.ndarray:
