@@ -134,7 +134,7 @@ def test_a_selected_image_whose_depth_is_not_that_of_a_keyframe_is_replaced_by_t
 
     def answer(number, keyframe):
         depth = np.ones((r.HEIGHT, r.WIDTH), np.float32)
-        fused = FusedDepth(stamp_ns=r.T0 + number, depth_m=depth, sigma_m=depth, keyframe=keyframe)
+        fused = FusedDepth.of(depth, depth, stamp_ns=r.T0 + number, keyframe=keyframe)
         assert list(node.handle("fusion/depth", fused)) == []
 
     assert decide(0)
