@@ -22,10 +22,11 @@ def poll(supervisor, until, timeout_s):
     raise AssertionError(f"not within {timeout_s} s")
 
 
-def publish_until_received(publication, message, received, times=3, timeout_s=30.0):
-    """Publish `message` repeatedly until the list `received` has at least `times` entries."""
+def publish_until_received(publication, message, received, times=3, timeout_s=30.0, later_ns=0):
+    """Publish `message` repeatedly, stamped `later_ns` later each time, until `received` has `times` entries."""
     deadline = time.monotonic() + timeout_s
     while len(received) < times and time.monotonic() < deadline:
         publication.put(message)
+        message = message.model_copy(update={"stamp_ns": message.stamp_ns + later_ns})
         time.sleep(0.05)
     assert len(received) >= times

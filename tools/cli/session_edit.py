@@ -26,8 +26,14 @@ def edit(
         list[str] | None,
         typer.Option(help='Polygon on the floor, "X,Y X,Y X,Y ..." (m): remove what is inside; repeatable'),
     ] = None,
-    low_m: Annotated[float, typer.Option(help="Remove only above this height over the floor")] = -_HIGHEST_M,
-    high_m: Annotated[float, typer.Option(help="Remove only below this height over the floor")] = _HIGHEST_M,
+    low_m: Annotated[
+        float,
+        typer.Option(min=-_HIGHEST_M, max=_HIGHEST_M, help="Remove only above this height over the floor"),
+    ] = -_HIGHEST_M,
+    high_m: Annotated[
+        float,
+        typer.Option(min=-_HIGHEST_M, max=_HIGHEST_M, help="Remove only below this height over the floor"),
+    ] = _HIGHEST_M,
     floaters: Annotated[
         int,
         typer.Option(min=0, help="Remove groups of fewer Gaussians than this that touch nothing else"),
