@@ -7,6 +7,7 @@ import time
 import cv2
 import numpy as np
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.messages import Correction, FusedDepth, Image, Odometry, Rig, Scan
@@ -80,7 +81,7 @@ class CirclingLocalization(Node):
 
 
 class FloorDepthConfig(NodeConfig):
-    scale: float = SCALE
+    scale: Remote[float] = SCALE
 
 
 class FloorDepth(Node):
