@@ -231,7 +231,8 @@ class LiveMap(MapSource):
         except DecodeError:
             self._reject("chunks of the 3D map: not decodable")
             return
-        # A new process is followed when its health has been accepted; its snapshot has what came before.
+        # Messages of a new mapper are taken once its health report was accepted. The snapshot that is then
+        # requested contains what it published before.
         if envelope.header.instance != self._mapper:
             return
         message = envelope.message
