@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -176,8 +177,9 @@ def test_of_a_robot_that_stands_still_one_pose_per_second_crosses(sides):
 
     _kept = declare_subscription(edge.open(), f"beamsplat/r1/{row.name}", row, "every", take)
     publication = robot.publications[row.name]
-    wait_until(lambda: publication.put(pose(0, status="lost")) and stamps)
-    stamps.clear()
+    # Each of these differs from the one before: the first ones may be sent before the subscription is known.
+    here_or_there_m = itertools.cycle((0.0, 1.0))
+    wait_until(lambda: publication.put(pose(0, next(here_or_there_m), status="lost")) and stamps)
     noise = np.random.default_rng(1).normal(0.0, 0.001, (60, 2))
     for number in range(1, 61):  # six seconds at rest
         publication.put(pose(number, *noise[number - 1]))
@@ -190,7 +192,7 @@ def test_of_a_robot_that_stands_still_one_pose_per_second_crosses(sides):
     wait_until(lambda: row.name in bridge.ended)
     wait_until(lambda: 83 in stamps)  # the last one before the end crosses in any case
     expected = [1, 11, 21, 31, 41, 51, *range(61, 81)]
-    assert stamps[: len(expected)] == expected
+    assert [stamp for stamp in stamps if stamp > 0][: len(expected)] == expected
     at_rest_bytes_per_s = bridge.forwarded[row.name].bytes / bridge.forwarded[row.name].messages
     assert at_rest_bytes_per_s < 1000
     now_ns[0] += 60 * 10**9  # what is missing does not count as lost later either
