@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.occupancy import HIT, MISS, TileSum, outline
 from beamsplat.services.localization.lidar2d.pose_graph_data import Submap
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 from beamsplat.tools.compare.drive import MappedDrive
 
 CELL_M = LidarSlamSettings().cell_m

@@ -9,6 +9,7 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.dynamic_objects import contradicts_free_space, grow_along_beams
+from beamsplat.services.localization.lidar2d.frozen_map import freeze
 from beamsplat.services.localization.lidar2d.local_trajectory_builder import LocalMap
 from beamsplat.services.localization.lidar2d.node_scan import NodeScan
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid
@@ -23,7 +24,7 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import (
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
+from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap
 
 NS = 1e-9
 

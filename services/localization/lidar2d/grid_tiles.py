@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beamsplat.common.mapfiles.grid_tiles import TILE_CELLS, pack_tile, unpack_tile
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid, TileSum, outline
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 TILES_PER_UPDATE = 24  # drawn at most; the others follow in the next updates, the oldest change first
 # A subscriber that joins late receives the newest 1024 tiles from the publisher's cache (common/topics.py).

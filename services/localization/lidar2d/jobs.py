@@ -10,6 +10,7 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.drift_model import DriftModel
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays, optimise
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
 from beamsplat.services.localization.lidar2d.loops import LoopCandidate, match_locally
@@ -18,7 +19,6 @@ from beamsplat.services.localization.lidar2d.refinement import refine_submaps
 from beamsplat.services.localization.lidar2d.revisits import find_revisits, nearest_member, submaps_of
 from beamsplat.services.localization.lidar2d.segments import first_of_components, join_components
 from beamsplat.services.localization.lidar2d.snapshot import Snapshot
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 ITERATIONS, LAST_ITERATIONS = 10, 16
 MAX_JOBS_WITHOUT_OPTIMISATION = 5

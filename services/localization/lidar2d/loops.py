@@ -9,6 +9,7 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.correlative import search
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.observability import (
     keep_guess_if_unobservable,
     reduce_unobservable,
@@ -21,7 +22,6 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import (
 )
 from beamsplat.services.localization.lidar2d.scan_matching import Match, refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 # Offsets in nodes along the trajectory at which a global loop closure is verified.
 VERIFICATION_OFFSETS = (

@@ -10,11 +10,11 @@ import numpy as np
 from beamsplat.common.files.journal import Record
 from beamsplat.common.files.numbered_state import Arrays, packed_arrays
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.node_scan import NodeScan
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, Submap, TrajectoryNode
 from beamsplat.services.localization.lidar2d.refinement import rebuild_submap
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 
 NODES, SUBMAP, CONSTRAINTS, TRAJECTORY = 1, 2, 3, 4  # kinds of records

@@ -13,6 +13,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.files.journal import Record, append_records
 from beamsplat.common.files.numbered_state import numbered_files, read_json
 from beamsplat.services.localization.lidar2d import map_records
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.map_records import SavedMap
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
@@ -23,7 +24,6 @@ from beamsplat.services.localization.lidar2d.state import (
     manifest_settings,
     map_files,
 )
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 
 _SUFFIX = ".journal"

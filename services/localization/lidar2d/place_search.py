@@ -13,11 +13,11 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.branch_bound import branch_and_bound
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.loops import match_score
 from beamsplat.services.localization.lidar2d.pose_graph_data import TableCache
 from beamsplat.services.localization.lidar2d.scan_matching import Match, refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 SEARCH_RETURNS = 120  # returns of the chunk that branch and bound uses
 SEARCH_STEP_RAD = math.radians(1.0)

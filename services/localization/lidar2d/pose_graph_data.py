@@ -13,12 +13,13 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.graph_kernels import invert3
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
 from beamsplat.services.localization.lidar2d.node_scan import NodeScan
 from beamsplat.services.localization.lidar2d.search_pyramid import SearchPyramid, search_pyramid
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
+from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
 _K = TypeVar("_K")
 _T = TypeVar("_T")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap, freeze
 from beamsplat.services.localization.lidar2d.observability import (
     keep_guess_if_unobservable,
     reduce_unobservable,
@@ -16,7 +17,7 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import (
 )
 from beamsplat.services.localization.lidar2d.scan_matching import refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables, SurfelMap, freeze
+from beamsplat.services.localization.lidar2d.surfel_map import MatchTables, SurfelMap
 
 UNMOVED_M, UNMOVED_RAD = 0.02, 0.005  # limits of _has_moved()
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
 from beamsplat.services.localization.lidar2d.pose_graph_data import (
     Constraint,
@@ -14,7 +15,6 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import (
     TrajectoryNode,
 )
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.node_scan import NodeScan
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, Submap, TrajectoryNode
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 
 def unpack(a: dict[str, np.ndarray], graph: PoseGraph) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import pytest
 
 from beamsplat.common.messages.robot import MAX_BEAMS
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.frozen_map import FrozenMap
 from beamsplat.services.localization.lidar2d.map_records import SavedMap
 from beamsplat.services.localization.lidar2d.map_saver import MapSaver
 from beamsplat.services.localization.lidar2d.node_scan import NodeScan
@@ -16,7 +17,6 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import TableCache
 from beamsplat.services.localization.lidar2d.scan import prepare_scan
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.state import load_state, read_manifest
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 from tests.services.localization.graphs import SUBMAP_NODES, finish_submap, grow, room_scan
 

@@ -12,13 +12,14 @@ from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.branch_bound import branch_and_bound
 from beamsplat.services.localization.lidar2d.cholesky import solve
 from beamsplat.services.localization.lidar2d.correlative import correlate, search
+from beamsplat.services.localization.lidar2d.frozen_map import freeze
 from beamsplat.services.localization.lidar2d.matching_kernels import TANGENT_VARIANCE_M2, accumulate
 from beamsplat.services.localization.lidar2d.scan import prepare_scan
 from beamsplat.services.localization.lidar2d.scan_matching import TwistPrior, refine
 from beamsplat.services.localization.lidar2d.search_pyramid import LEVELS, build_pyramid
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_kernels import merged_surfel
-from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
+from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap
 from beamsplat.services.localization.lidar2d.twist import exp_twist
 from tests.services.localization.world import RayCastLidar
 
