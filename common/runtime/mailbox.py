@@ -97,7 +97,7 @@ class Mailbox:
         """
         count, header, now_ns = self.counts[envelope.topic], envelope.header, self._now_ns()
         process = ProcessId(header.producer, header.epoch, header.instance)
-        if not self._accepts(count, process, now_ns):
+        if not self._accepts(count, process, now_ns, self._is_silent(count, now_ns)):
             if self._deliveries[envelope.topic] == "latched":  # it may be published only once
                 self._refused_latched[envelope.topic] = envelope
             return False
@@ -161,9 +161,12 @@ class Mailbox:
             return current is None
         return now_ns - self._heard_ns.get(current.instance, count.arrival_ns) > SILENCE_S * 1e9
 
-    def _accepts(self, count: InputCount, process: ProcessId, now_ns: int) -> bool:
-        """Return whether `process` is the producer of an input, perhaps from now on; else count why not."""
-        verdict = count.producer.judge(process, self._is_silent(count, now_ns))
+    def _accepts(self, count: InputCount, process: ProcessId, now_ns: int, silent: bool) -> bool:
+        """Return whether `process` is the producer of an input, perhaps from now on; else count why not.
+
+        `silent`: see `AcceptedProducer.judge`.
+        """
+        verdict = count.producer.judge(process, silent)
         if verdict in ("stale", "refused"):
             setattr(count, verdict, getattr(count, verdict) + 1)
             return False
@@ -189,10 +192,11 @@ class Mailbox:
         """Mark an input as ended: `process` has sent its last message, `sent` messages in all.
 
         Messages that have not arrived by now are lost. `process` = None: nothing publishes on this topic.
-        Return False, and change nothing, if `process` is not accepted as the producer.
+        Return False, and change nothing, if `process` is not accepted as the producer. For the end of a
+        stream, a silence of its producer is not enough: a node whose inputs have all ended cannot go on.
         """
         count = self.counts[topic]
-        if process is not None and not self._accepts(count, process, self._now_ns()):
+        if process is not None and not self._accepts(count, process, self._now_ns(), silent=False):
             return False
         count.ended_by, count.ended_after = process.instance if process else NO_PRODUCER, sent
         if self._deliveries[topic] == "every":

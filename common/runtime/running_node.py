@@ -144,10 +144,8 @@ class RunningNode:
             silence_s = min(self.mailbox.silence_s(topic), now - arrived)
             if silence_s < (_END_SILENCE_S if complete else _END_TIMEOUT_S):
                 continue
-            if self.mailbox.end(topic, process, sent):
-                del self._ends[topic, process]
-            else:  # not accepted as the producer: tried again after a pause
-                self._ends[topic, process] = (sent, now)
+            self.mailbox.end(topic, process, sent)  # refused and counted if it is not of the producer
+            del self._ends[topic, process]
 
     def emit(self, outputs: Iterator[Output]) -> None:
         """Publish the messages and start the jobs in `outputs`; in standby, messages are stored instead."""

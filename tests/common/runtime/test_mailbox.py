@@ -190,6 +190,26 @@ def test_a_process_without_proof_is_accepted_after_a_silence_and_gives_way_to_th
     assert not mailbox.put(_scan(3, by=STRANGER._replace(epoch=1)))
 
 
+def test_an_end_marker_without_proof_ends_nothing_however_long_the_producer_is_silent():
+    """A node whose inputs have all ended cannot go on, and a stalled producer does."""
+    clock = Clock()
+    mailbox = Mailbox(Chain, clock)
+    assert mailbox.put(_scan(0))
+    for name in ("lidar/scan", "wheel/odometry"):
+        mailbox.end(name, None)
+    assert mailbox.pop() is not None
+    assert mailbox.put(_scan(1))  # goes on: nobody has ended it
+    mailbox.pop()
+    clock.ns += 60 * S
+    assert not mailbox.end("lidar/scan", STRANGER, 0)
+    assert not mailbox.ended
+    assert _health(mailbox).refused == 1
+    assert mailbox.put(_scan(2))
+    mailbox.pop()
+    assert mailbox.end("lidar/scan", FIRST, 3)
+    assert mailbox.ended
+
+
 def _correction(number, by):
     correction = Correction(stamp_ns=0, T_map_odom=np.eye(4))
     header = Header(0, 0, 0, number, by.epoch, by.node, by.instance)

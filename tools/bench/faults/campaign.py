@@ -288,16 +288,19 @@ class Campaign:
         return [(gap, *explained(gap, known)) for gap in self._poses.gaps]
 
     def _lost_keyframes(self) -> list[int]:
-        """Return the ids of keyframes that the robot made and that are neither at the edge nor refused."""
+        """Return the ids of keyframes that the robot made and that are nowhere: not at the edge, not refused.
+
+        What is in the outbox is sent after the next start: the robot makes keyframes until it is stopped.
+        """
         from beamsplat.common.mapfiles.session import SessionFolder
 
         session = SessionFolder(Path(self._hosts.edge.deployment.nodes["mapping"]["session"]))
-        lost = self._keyframes.made - set(session.keyframe_ids()) - set(self._keyframes.refused)
+        waiting = self._keyframes.waiting()
+        lost = self._keyframes.made - set(session.keyframe_ids()) - set(self._keyframes.refused) - waiting
         if lost:
             acknowledged = len(lost & self._keyframes.acknowledged)
-            waiting = len(lost & self._keyframes.waiting())
-            self._find(f"{len(lost)} keyframes are lost, of which {acknowledged} were acknowledged and "
-                       f"{waiting} are in the outbox still: {sorted(lost)[:5]}")  # fmt: skip
+            ids = sorted(lost)[:5]
+            self._find(f"{len(lost)} keyframes are lost, of which {acknowledged} were acknowledged: {ids}")
         return sorted(lost)
 
     # --- report ---
