@@ -59,6 +59,40 @@ def encode(message: Message, keep: bool = False) -> bytes:
     return payload
 
 
+def encode_into(message: Message, buffer: bytearray) -> bytes | bytearray:
+    """Return the payload of a message as `encode` does: the one that is kept with it, or `buffer` with it.
+
+    A buffer that is used again has its memory already; that of a new payload of a megabyte is 256 pages that
+    the system must fill with zeros first.
+
+    Args:
+        buffer: its content and size are replaced.
+
+    Raises:
+        ValueError: see `encode`.
+    """
+    payload = kept_payload(message)
+    if payload is not None:
+        return payload
+    pieces = _pieces(message)
+    size = sum(map(_size, pieces))
+    if len(buffer) < size:
+        buffer.extend(bytes(size - len(buffer)))
+    del buffer[size:]
+    with memoryview(buffer) as view:
+        position = 0
+        for piece in pieces:
+            end = position + _size(piece)
+            if end > position:  # a view of nothing cannot be cast
+                view[position:end] = memoryview(piece).cast("B")
+            position = end
+    return buffer
+
+
+def _size(piece: bytes | memoryview) -> int:
+    return piece.nbytes if isinstance(piece, memoryview) else len(piece)
+
+
 def kept_payload(message: Message) -> bytes | None:
     """Return the payload that is kept with a message, of the schema `schema_of`; None without one."""
     return getattr(message, "kept_payload", None)

@@ -347,7 +347,10 @@ NodeState = Literal["configure", "standby", "active", "drain", "drained", "close
 
 
 class Health(Message):
-    """State, message counts and resource use of one node, published by each node at 1 Hz."""
+    """State, message counts and resource use of one node, published by each node at 1 Hz.
+
+    New fields follow all others, here and in the classes of its entries: `health_codec` needs their order.
+    """
 
     # 1.1: pid; 1.2: state "failed", counters `late` and `refused`; 1.3: rejected; 1.4: status, figures,
     # clock_id
@@ -373,6 +376,12 @@ class Health(Message):
     clock_id: Annotated[int, Field(ge=0, lt=2**64)] = 0
 
 
+class HealthBundle(Message):
+    """The newest health reports of the nodes of one side of a link, for the other side (`health_codec`)."""
+
+    packed: Annotated[np.ndarray, Array("uint8", "B")]
+
+
 class Answer(Message):
     """Result of a command as one sentence."""
 
@@ -385,6 +394,6 @@ MESSAGES: dict[str, type[Message]] = {
         Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
         GridTile, DepthEstimate, FusedDepth, Cloud, KeyframeCandidate, KeyframeDecision, Keyframe,
         KeyframeAck, MapChunk, MapAnchors, MapPoses, MapPreview, MapRender, MapState, MapStatus, Tick,
-        Health, Answer,
+        Health, HealthBundle, Answer,
     )
 }  # fmt: skip

@@ -30,7 +30,7 @@ from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.runtime.running_node import POLL_S, RunningNode
 from beamsplat.common.security.logins import login_of
 from beamsplat.common.topics import HEALTH
-from beamsplat.common.zenoh.bus import Bus, open_session
+from beamsplat.common.zenoh.bus import IMAGE_POOL_BYTES, SHM_POOL_BYTES, Bus, open_session
 from beamsplat.common.zenoh.queries import ask, reject, reply
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,10 @@ class Live:
             self._position.clear()
         try:
             login = login_of(settings.security, node.name)
-            session = open_session(settings.endpoints, should_stop=lambda: self._stopping, login=login)
+            session = open_session(
+                settings.endpoints, should_stop=lambda: self._stopping, login=login,
+                pool_bytes=IMAGE_POOL_BYTES if "camera/image" in node.outputs else SHM_POOL_BYTES,
+            )  # fmt: skip
         except UserError:
             if self._stopping:
                 return

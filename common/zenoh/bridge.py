@@ -3,24 +3,34 @@
 The column `uplink` of the topic table selects the topics that are forwarded, and the direction. All other
 topics stay on their host: no subscription on the other side can request them over a slow radio link. Small
 and large messages use separate connections, so that an image never delays a pose. End-of-stream markers and
-health reports are forwarded too.
+health reports are forwarded too: those of all nodes of one side together, once a second.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import zenoh
 
-from beamsplat.common.messages import Health, Odometry
+from beamsplat.common.messages import Odometry
+from beamsplat.common.messages.codec import encode
 from beamsplat.common.messages.header import DecodeError
 from beamsplat.common.runtime.pacing import TokenBucket
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.topics import HEALTH, TOPICS, Topic
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.health_samples import (
+    BUNDLE,
+    BUNDLE_ENCODING,
+    HEALTH_ROW,
+    HealthCollection,
+    decode_health,
+    is_bundle,
+)
 from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import (
     FIFO_MESSAGES,
@@ -37,7 +47,7 @@ log = logging.getLogger(__name__)
 # For the health reports of all nodes of one side (1 Hz each): one side must not load the other's CPU.
 _HEALTH_MAX_HZ = 100.0
 _RESENT_QUEUE_MESSAGES = 8  # of a topic that is resent until acknowledged: a slow link drops the oldest
-_HEALTH_ROW = Topic(HEALTH, Health, (), 1, "every")
+_HEALTH_PERIOD_S = 1.0  # as that of the reports
 
 
 @dataclass(frozen=True)
@@ -146,19 +156,51 @@ class Bridge:
         self._forward(source, f"end/{row.name}", end, send_end, None)
 
     def _forward_health(self, source: zenoh.Session, target: zenoh.Session) -> None:
-        bucket = TokenBucket(_HEALTH_MAX_HZ)
+        """Collect the reports of the nodes on the side of `source`, and send them to `target` together.
 
-        def send(sample: zenoh.Sample) -> bool:
-            decode_header(sample, _HEALTH_ROW)
+        They are sent once a second, and at once if the state of a node has changed.
+        """
+        bucket, lock, collected = TokenBucket(_HEALTH_MAX_HZ), threading.Lock(), HealthCollection()
+        count = self.forwarded.setdefault(HEALTH, ForwardedTraffic())
+
+        def collect(sample: zenoh.Sample) -> bool:
+            header = decode_header(sample, HEALTH_ROW)
+            if is_bundle(sample):  # from elsewhere: only nodes of this side are forwarded
+                return False
             if not bucket.take():
                 self.health_dropped += 1
                 return False
-            target.put(
-                sample.key_expr, sample.payload, encoding=sample.encoding, attachment=sample.attachment
-            )
-            return True
+            (health,) = decode_health(sample)
+            with lock:
+                changed = collected.add(health, header)
+            if changed:
+                send()
+            return False
 
-        self._forward(source, f"{HEALTH}/*", _HEALTH_ROW, send, HEALTH)
+        def send() -> None:
+            with lock:
+                taken = collected.take()
+            if taken is None:
+                return
+            payload = encode(taken[0])
+            try:
+                target.put(
+                    key(self._robot, HEALTH, BUNDLE), payload, encoding=BUNDLE_ENCODING,
+                    attachment=taken[1].pack(),
+                )  # fmt: skip
+            except zenoh.ZError:  # the connection broke, or the session was closed
+                self.interrupted += 1
+                return
+            count.messages += 1
+            count.bytes += len(payload)
+
+        def send_until_closed() -> None:
+            while not source.is_closed():
+                time.sleep(_HEALTH_PERIOD_S)
+                send()
+
+        self._forward(source, f"{HEALTH}/*", HEALTH_ROW, collect, None)
+        threading.Thread(target=send_until_closed, name="forward-health-bundles", daemon=True).start()
 
     def _forward(
         self,

@@ -4,6 +4,7 @@ All keys of a robot start with `beamsplat/<robot>/`:
 
     <topic>                       messages; header in the attachment, schema in the encoding
     health/<node>                 health report, once a second
+    health/bundle                 health reports of the nodes on the other side of the uplink
     end/<topic>                   end-of-stream marker of the producer (latched)
     alive/<node>/<instance>       liveliness token of an active node
     failed/<node>/<instance>      liveliness token of a node that cannot run, declared by its supervisor
@@ -39,6 +40,7 @@ from beamsplat.common.security.access_control import access_control, read_hosts
 from beamsplat.common.security.keys import NO_SECURITY, HostKeys, SecurityConfig, check_endpoint, is_secure
 from beamsplat.common.security.logins import Login, require_logins
 from beamsplat.common.topics import HEALTH, LIMIT_KB, Topic, topic
+from beamsplat.common.zenoh.health_samples import decode_health
 from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import (
     Producer,
@@ -57,7 +59,10 @@ ROOT = "beamsplat"
 URGENT_BUFFER_BYTES = 32 * 1024
 BULK_BUFFER_BYTES = 256 * 1024
 HEADERS_BYTES = 64 * 1024  # of Zenoh and of our own, beside the payload of a message
-SHM_POOL_BYTES = 64 * 1024 * 1024  # Zenoh's shared-memory pool of one process
+# Zenoh's shared-memory pool of one process. All of it is resident, and receivers keep it mapped after its
+# process has ended. A message for which the pool has no room crosses a TCP connection instead.
+SHM_POOL_BYTES = 8 * 1024 * 1024  # six depth estimates of 640x480, which are 1.2 MB each
+IMAGE_POOL_BYTES = 16 * 1024 * 1024  # of sources of images: two raw images of 1920x1080
 
 
 def key(robot: str, *parts: str) -> str:
@@ -65,7 +70,7 @@ def key(robot: str, *parts: str) -> str:
     return "/".join((ROOT, robot, *parts))
 
 
-def _base_config(mode: str) -> zenoh.Config:
+def _base_config(mode: str, pool_bytes: int = SHM_POOL_BYTES) -> zenoh.Config:
     config = zenoh.Config()
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -76,7 +81,7 @@ def _base_config(mode: str) -> zenoh.Config:
     config.insert_json5(
         "connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"
     )
-    config.insert_json5("transport/shared_memory/transport_optimization/pool_size", str(SHM_POOL_BYTES))
+    config.insert_json5("transport/shared_memory/transport_optimization/pool_size", str(pool_bytes))
     return config
 
 
@@ -137,20 +142,21 @@ def router_config(
 
 def open_session(
     endpoints: tuple[str, ...], wait_s: float = 15.0, should_stop: Callable[[], bool] = lambda: False,
-    login: Login | None = None,
+    login: Login | None = None, pool_bytes: int = SHM_POOL_BYTES,
 ) -> zenoh.Session:  # fmt: skip
     """Open a client session to the router at one of `endpoints`; retry for `wait_s` seconds.
 
     Args:
         should_stop: called after each failed attempt; a True result ends the attempts early.
         login: user name and password for a router that requires logins.
+        pool_bytes: size of the shared memory of the session.
 
     Raises:
         UserError: an endpoint is malformed, or no router answered before the time-out or before
             `should_stop()` was True.
     """
     zenoh.init_log_from_env_or("error")
-    config = _base_config("client")
+    config = _base_config("client", pool_bytes)
     _set_endpoints(config, "connect", endpoints)
     if login is not None:
         login.identify(config)
@@ -338,16 +344,15 @@ class Bus:
             key(self.robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
         )
         self._declared.append(subscriber)
-        row = Topic(HEALTH, Health, (), 1, "latest")
 
         def handle(sample: zenoh.Sample) -> None:
             try:
-                health = decode_sample(sample, row).message
+                reports = decode_health(sample)
             except DecodeError as error:
                 on_undecodable(HEALTH, f"{sample.key_expr}: {error}")
                 return
-            assert isinstance(health, Health)  # the row's message type
-            on_health(health)
+            for health in reports:
+                on_health(health)
 
         receive_in_thread(self.session, "watch-health", subscriber, handle)
 

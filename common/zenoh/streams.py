@@ -14,7 +14,7 @@ import zenoh
 import zenoh.ext
 
 from beamsplat.common.messages import Message
-from beamsplat.common.messages.codec import MEDIA_TYPE, decode, encode, schema_of
+from beamsplat.common.messages.codec import MEDIA_TYPE, decode, encode, encode_into, schema_of
 from beamsplat.common.messages.header import MAX_BACKLOG, DecodeError, Header
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 FIFO_MESSAGES = 256  # queue between Zenoh and the receiving thread, for an `every` input without a cache
+_KEPT_BUFFER_BYTES = 2_000_000  # of the payloads of one topic; a larger buffer is freed after each message
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
 
 
@@ -103,6 +104,7 @@ class Publication:
         self.bytes = 0
         self.refused = 0  # messages that are larger than the limit of the topic
         self._refusal_log = RateLimitedLog()
+        self._buffer = bytearray()  # of the payload that is being published
         self._publisher = declare_publication(session, key_expr, row)
 
     def put(self, message: Message, backlog: int = 0) -> Header | None:
@@ -113,15 +115,14 @@ class Publication:
         Return None, and count and log the message, if it is larger than the limit of its topic: routers and
         subscribers would drop it.
         """
-        try:
-            payload = encode_within(message, self.row.limit_kb, self.row.name)
-        except ValueError as error:
-            with self._lock:
+        with self._lock:
+            try:
+                payload = encode_within(message, self.row.limit_kb, self.row.name, self._buffer)
+            except ValueError as error:
                 self.refused += 1
                 if (count := self._refusal_log.due(self.row.name)) is not None:
                     log.error("not published (%d more since the last report): %s", count, error)
-            return None
-        with self._lock:
+                return None
             header = Header(
                 stamp_ns=message.stamp_ns,
                 publish_ns=time.monotonic_ns(),
@@ -132,19 +133,23 @@ class Publication:
                 instance=self._producer.instance,
                 backlog=min(backlog, MAX_BACKLOG),
             )
-            self._publisher.put(payload, attachment=header.pack())
+            self._publisher.put(payload, attachment=header.pack())  # copies the payload
             self.sent += 1
             self.bytes += len(payload)
+            if len(self._buffer) > _KEPT_BUFFER_BYTES:
+                self._buffer = bytearray()
         return header
 
 
-def encode_within(message: Message, limit_kb: int, subject: str) -> bytes:
-    """Return the payload of a message of a topic or query, `subject`.
+def encode_within(
+    message: Message, limit_kb: int, subject: str, buffer: bytearray | None = None,
+) -> bytes | bytearray:  # fmt: skip
+    """Return the payload of a message of a topic or query, `subject`; for `buffer` see `encode_into`.
 
     Raises:
         ValueError: the payload is larger than `limit_kb`, or its texts and numbers are too long (`encode`).
     """
-    payload = encode(message)
+    payload = encode(message) if buffer is None else encode_into(message, buffer)
     if len(payload) > limit_kb * 1000:
         raise ValueError(
             f"{subject}: {len(payload) / 1e6:.2f} MB in a {type(message).__name__} with stamp "

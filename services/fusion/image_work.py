@@ -12,7 +12,9 @@ from beamsplat.services.fusion.ordered_results import OrderedResults
 from beamsplat.services.fusion.result import FusionResult, rejected
 from beamsplat.services.fusion.single_image import SingleImageFusion
 
-_KEYFRAMES = 3  # that wait for their plane sweep, beside the one that is computed
+_KEYFRAMES = (
+    1  # that waits for its plane sweep, beside the one that is computed: each adds to the delay of all
+)
 _RESULTS = 16  # that wait for the sweep of an earlier keyframe: 40 MB at 640x480
 
 

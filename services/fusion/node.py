@@ -43,6 +43,7 @@ from beamsplat.services.fusion.image_work import CandidateImage, FusedImage, Ima
 from beamsplat.services.fusion.inputs import FusionInput
 from beamsplat.services.fusion.messages import cloud_message, depth_message, rejected_message
 from beamsplat.services.fusion.single_image import SingleImageFusion
+from beamsplat.services.fusion.warm import warm
 
 log = logging.getLogger("beamsplat.fusion")
 
@@ -85,7 +86,7 @@ class FusionNode(Node):
     inputs = (
         Input("rig", "every"),
         Input("camera/image", "every"),  # every image, so that each estimate finds its image
-        Input("depth/estimate", "latest", keep=4),
+        Input("depth/estimate", "latest", keep=3),
         "lidar/scan",
         "localization/odometry",
         "localization/movers",
@@ -95,6 +96,8 @@ class FusionNode(Node):
     outputs = ("keyframes/candidate", "fusion/depth", "fusion/cloud")
 
     def configure(self) -> None:
+        if self.config.method == "field" and self.live_settings is not None:
+            warm()  # else the first images of a drive wait for the kernels, and get no depth
         self._fusion: Fusion | SingleImageFusion | None = None
         self._check: StartupCheck | None = None  # of the calibration; only `field` has one
         self._images: deque[Image] = deque(maxlen=_IMAGES)

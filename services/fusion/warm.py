@@ -34,7 +34,9 @@ def warm() -> None:
         fusion.add_scan(points + T_map_body[:3, 3])
         beams = Beams(points, np.arange(200), np.full(200, 0.01))
         estimate = np.full((480, 640), 3.0, np.float32) + rng.uniform(0.0, 0.1, (480, 640)).astype(np.float32)
-        frame = FusionInput(i, np.roll(image, i, axis=1), T_map_body, beams, estimate, "relative")
+        shown = np.roll(image, i, axis=1)
+        shown.setflags(write=i < 2)  # raw images without distortion are views of received bytes
+        frame = FusionInput(i, shown, T_map_body, beams, estimate, "relative")
         fusion.fuse(frame, keyframe=i % 2 == 0)
     FreeSpaceGrid().add(np.zeros(2), points)
     _warm_learned()

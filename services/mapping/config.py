@@ -11,6 +11,7 @@ from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.engines.choice import EngineName
 from beamsplat.services.mapping.profiles import PAGED_GAUSSIANS, PROFILES
+from beamsplat.services.mapping.settings import MapperSettings
 
 PositiveFinite = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Steps = Annotated[int, Field(ge=0, le=100_000)]
@@ -66,3 +67,13 @@ class MappingConfig(NodeConfig):
             profile = profile._replace(max_gaussians=PAGED_GAUSSIANS)
         given = {key for key in self.model_fields_set if getattr(self, key) is not None}
         return self.model_copy(update={k: v for k, v in profile._asdict().items() if k not in given})
+
+    def mapper_settings(self) -> MapperSettings:
+        """Return the settings of the mapper by these options, which are those of an engine (`for_engine`)."""
+        assert self.max_gaussians is not None  # see `for_engine`
+        return MapperSettings(
+            half_iterations=self.half_steps, full_iterations=self.full_steps, stride_px=self.stride_px,
+            fine_stride_px=self.fine_stride_px, max_gaussians=self.max_gaussians,
+            max_keyframes=self.max_keyframes, refine_pose=self.refine_pose,
+            refine_exposure=self.refine_exposure,
+        )  # fmt: skip

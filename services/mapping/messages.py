@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -20,9 +21,11 @@ from beamsplat.common.messages import (
     KeyframeAck,
     MapAnchors,
     MapChunk,
+    MapPoses,
     MapPreview,
     MapRender,
     MapState,
+    MapStatus,
 )
 from beamsplat.common.messages.codec import encode, schema_of
 from beamsplat.common.messages.depth_codec import unpack_depth, unpack_mask, unpack_sigma
@@ -31,7 +34,7 @@ from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.services.mapping.chunks import ChunkUpdate
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
-from beamsplat.services.mapping.mapper import Mapper
+from beamsplat.services.mapping.mapper import InsertionResult, Mapper
 from beamsplat.services.mapping.preview import KeyframeRender, MapView
 
 _PIECE_BYTES = 4 << 20  # of a state in one message
@@ -150,6 +153,51 @@ def anchors_message(mapper: Mapper, stamp_ns: int) -> MapAnchors:
         stamp_ns=stamp_ns, pose_revision=mapper.pose_revision, anchor_ids=np.array(ids, np.int64),
         T_map_anchor=poses,
     )  # fmt: skip
+
+
+def poses_message(poses: tuple[np.ndarray, np.ndarray, np.ndarray]) -> MapPoses:
+    """Return the message of what `KeyframeIntake.poses` returns, of at least one keyframe."""
+    stamps_ns, T_map_body, ids = poses
+    return MapPoses(stamp_ns=int(stamps_ns[-1]), keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body)
+
+
+def status_message(
+    mapper: Mapper, outcome: InsertionResult, *, stamp_ns: int, keyframes: int, refused: int, loss: float,
+    psnr_db: float, depth_error_m: float, session: str,
+) -> MapStatus:  # fmt: skip
+    """Return the state of the map after the insertion of a keyframe.
+
+    Args:
+        outcome: of the insertion.
+        stamp_ns: of the keyframe.
+        keyframes, refused: their numbers in all.
+        loss: mean of the steps that followed.
+        psnr_db: PSNR of the keyframe, NaN if not measured.
+        depth_error_m: median error of its depth, m, NaN if not measured.
+        session: state of the saved map in one line; "" without one.
+    """
+    return MapStatus(
+        stamp_ns=stamp_ns, status=outcome.status, keyframes=keyframes, refused=refused,
+        gaussians=mapper.store.count + mapper.store.paged_out_count,
+        steps=mapper.steps, loss=loss, foretold_share=outcome.predicted_coverage,
+        foretold_psnr_db=outcome.predicted_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
+        session=session,
+    )  # fmt: skip
+
+
+def status_text(status: MapStatus, backlog: int, engine: str) -> str:
+    """Return a state of the map in one line.
+
+    Args:
+        backlog: keyframes that wait on the robot.
+        engine: what computes the map, in words.
+    """
+    quality = f", {status.psnr_db:.1f} dB" if math.isfinite(status.psnr_db) else ""
+    waiting = f", {backlog} wait on the robot" if backlog else ""
+    text = f"{status.keyframes} keyframes{waiting}, {status.gaussians} Gaussians{quality}" + (
+        f", {status.refused} refused (last: {status.status})" if status.status != "ok" else ""
+    )
+    return "; ".join(filter(None, (text, status.session, engine)))
 
 
 def state_messages(arrays: Arrays) -> Iterator[MapState]:

@@ -3,57 +3,29 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Iterator
-from itertools import chain
 
 from beamsplat.common.engines.choice import check_cuda, cuda_obstacle
-from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import check_can_write
-from beamsplat.common.harmonics.basis import coefficients
-from beamsplat.common.mapfiles.ply import write_map
-from beamsplat.common.messages import (
-    Anchors,
-    Image,
-    Keyframe,
-    MapChunk,
-    MapPoses,
-    MapRender,
-    MapState,
-    MapStatus,
-    Message,
-    Tick,
-)
+from beamsplat.common.messages import Anchors, Keyframe, Message, Tick
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs, StopRequested
-from beamsplat.services.mapping.chunks import ChunkCensus, ChunkFeed, Viewpoint, chunk_snapshot, disk_params
+from beamsplat.services.mapping.chunks import ChunkCensus, ChunkFeed
 from beamsplat.services.mapping.config import MappingConfig
 from beamsplat.services.mapping.engines.choice import OPTION, make_engine
 from beamsplat.services.mapping.intake import KeyframeIntake
 from beamsplat.services.mapping.mapper import FULL, HALF, InsertionResult, Mapper
-from beamsplat.services.mapping.messages import (
-    ack,
-    anchors_message,
-    chunk_message,
-    image_message,
-    keyframe_rgb,
-    preview_message,
-    render_message,
-    state_messages,
-)
-from beamsplat.services.mapping.preview import render_keyframe, render_view
-from beamsplat.services.mapping.queries import check_names, keyframe_id_of, view_of, viewpoint_of
+from beamsplat.services.mapping.messages import ack, anchors_message
+from beamsplat.services.mapping.outputs import MapOutputs
+from beamsplat.services.mapping.query_handlers import MapQueries
 from beamsplat.services.mapping.session.budgets import check_budget, check_gpu_budget
 from beamsplat.services.mapping.session.checkpointer import CheckpointResult
 from beamsplat.services.mapping.session.live_session import LiveSession, MapSession, NoSession
-from beamsplat.services.mapping.session.state import arrays_of
-from beamsplat.services.mapping.settings import MapperSettings
 from beamsplat.services.mapping.warm import warm
 
 log = logging.getLogger("beamsplat.mapping")
 
 
-class MappingNode(Node):
+class MappingNode(MapQueries, MapOutputs):
     """Inserts keyframes, in any order of arrival, and optimises the map.
 
     With a session, a keyframe is acknowledged as soon as it is stored in the session on disk; without a
@@ -91,20 +63,15 @@ class MappingNode(Node):
         warm()
         engine = make_engine(c.engine, c.threads, c.gpu_memory_mb, c.sh_degree)
         self.config = c = c.for_engine(engine.identity.name)
-        assert c.max_gaussians is not None  # see `for_engine`
-        settings = MapperSettings(
-            half_iterations=c.half_steps, full_iterations=c.full_steps, stride_px=c.stride_px,
-            fine_stride_px=c.fine_stride_px, max_gaussians=c.max_gaussians, max_keyframes=c.max_keyframes,
-            refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
-        )  # fmt: skip
-        self._mapper = Mapper(settings, seed=c.seed, engine=engine)
+        self._mapper = Mapper(c.mapper_settings(), seed=c.seed, engine=engine)
         self._mapper.must_stop = self._must_pause
         self._now_ns = 0  # newest stamp that has arrived: the time of the data
+        self._newest_keyframe_ns = 0  # that has arrived
         self._interruptible = self._interrupted = False  # owed steps, by the arrival of a keyframe
         self._intake = KeyframeIntake(self._mapper)
         self._feed = ChunkFeed()
-        self._viewpoint: Viewpoint | None = None  # of the newest keyframe
-        self._backlog = 0  # keyframes that wait on the robot
+        self._viewpoint = None
+        self._backlog = 0
         self._check_budgets()
         if not self.in_standby:
             self.take_over()
@@ -167,6 +134,7 @@ class MappingNode(Node):
             self._now_ns = message.stamp_ns
         elif isinstance(message, Keyframe):
             self._now_ns = max(self._now_ns, message.stamp_ns)
+            self._newest_keyframe_ns = max(self._newest_keyframe_ns, message.stamp_ns)
             self._interrupted = True
         if isinstance(self._session, NoSession) or not isinstance(message, Keyframe):
             return
@@ -198,12 +166,12 @@ class MappingNode(Node):
         plan.owe("window", HALF, c.half_steps - half)
         plan.owe("window", FULL, c.full_steps - full)
         self._session.keep_budget()
-        if delay_s < c.latency_s:
+        if message.stamp_ns >= self._newest_keyframe_ns:
             yield from self._show(message, outcome, loss)
             if len(self._mapper.keyframes) % c.chunk_every == 0:
                 census = ChunkCensus(self._mapper, self._viewpoint)
                 yield from self._chunk(census, message.anchor_id, message.stamp_ns)
-        else:  # ticks publish the chunk; nobody waits for the preview
+        else:  # a newer one waits: its preview is shown, and ticks publish the chunk
             yield "mapping/status", self._status(message.stamp_ns, outcome, loss)
         if not from_disk:  # its stamp would be an old one, between new ones: a checkpoint each time
             yield from self._checkpoint(message.stamp_ns)
@@ -221,11 +189,6 @@ class MappingNode(Node):
         self._mapper.optimise_owed()
         self._interruptible = False
         self._report_owed()
-
-    def _report_owed(self) -> None:
-        plan = self._mapper.plan
-        self.figures.set("map_owed_steps", plan.count)
-        self.rejections.set("optimisation steps never done: too many were owed", plan.dropped)
 
     def _must_pause(self) -> bool:
         """Return whether the steps must end: with the process, or because a keyframe has arrived."""
@@ -275,95 +238,6 @@ class MappingNode(Node):
             yield from self._chunk(census, oldest, tick.stamp_ns)
         yield from self._checkpoint(tick.stamp_ns)
 
-    # --- outputs ---
-
-    def _show(self, message: Keyframe, outcome: InsertionResult, loss: float) -> Outputs:
-        preview = render_keyframe(self._mapper, message.id)
-        focal_px, error_px = message.camera.fx_px, self.config.chunk_error_px
-        self._viewpoint = Viewpoint(preview.T_map_camera[:3, 3], focal_px, error_px)
-        yield "mapping/preview", preview_message(message, preview)
-        status = self._status(message.stamp_ns, outcome, loss, preview.psnr_db, preview.depth_error_m)
-        yield "mapping/status", status
-
-    def _status(
-        self, stamp_ns: int, outcome: InsertionResult, loss: float, psnr_db: float = math.nan,
-        depth_error_m: float = math.nan,
-    ) -> MapStatus:  # fmt: skip
-        m, keyframes, rejected = self._mapper, len(self._intake.stored()), len(self._intake.rejections)
-        self._report_owed()
-        gaussians, session = m.store.count + m.store.paged_out_count, self._session.status_text()
-        quality = f", {psnr_db:.1f} dB" if math.isfinite(psnr_db) else ""
-        waiting = f", {self._backlog} wait on the robot" if self._backlog else ""
-        self.detail = f"{keyframes} keyframes{waiting}, {gaussians} Gaussians{quality}" + (
-            f", {rejected} refused (last: {outcome.status})" if not outcome.ok else ""
-        )
-        self.detail += f"; {session}" if session else ""
-        self.detail += f"; {m.engine.description}"
-        return MapStatus(
-            stamp_ns=stamp_ns, status=outcome.status, keyframes=keyframes, refused=rejected,
-            gaussians=gaussians, steps=m.steps, loss=loss, foretold_share=outcome.predicted_coverage,
-            foretold_psnr_db=outcome.predicted_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
-            session=session,
-        )  # fmt: skip
-
-    def _chunk(self, census: ChunkCensus, anchor: int, stamp_ns: int) -> Outputs:
-        """Publish the chunk of an anchor, if there is new visible detail."""
-        part = self._feed.take_update(census, anchor)
-        if part is not None:
-            yield "mapping/chunk", chunk_message(self._mapper, anchor, part, stamp_ns)
-
-    def on_query_snapshot(self, parameters: dict[str, str]) -> Iterator[MapChunk]:
-        """Yield the whole map, chunk by chunk, for a viewer that has just joined.
-
-        With the parameters `from=X,Y,Z` (m, map frame), `focal_px` and `error_px`, detail that is invisible
-        from this viewpoint is omitted.
-        """
-        viewpoint = viewpoint_of(parameters)
-        self._check_map("snapshot")
-        for anchor, part in chunk_snapshot(self._mapper, viewpoint):
-            yield chunk_message(self._mapper, anchor, part, 0)
-
-    def on_query_render(self, parameters: dict[str, str]) -> Iterator[MapRender]:
-        """Yield the map as a camera would see it.
-
-        Parameters: `position=X,Y,Z` (m) and `quaternion=X,Y,Z,W` of the optical frame in the map frame;
-        `width_px`, `height_px` and `focal_px` for another camera than that of the keyframes at half size.
-        """
-        T_map_camera, camera = view_of(parameters)
-        self._check_map("render")
-        yield render_message(render_view(self._mapper, T_map_camera, camera), T_map_camera)
-
-    def on_query_poses(self, parameters: dict[str, str]) -> Iterator[MapPoses]:
-        """Yield the refined poses of all keyframes, as `mapping/poses` has them at the end of a drive."""
-        check_names("poses", parameters, ())
-        self._check_map("poses")
-        stamps_ns, T_map_body, ids = self._intake.poses()
-        yield MapPoses(
-            stamp_ns=int(stamps_ns[-1]), keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body
-        )
-
-    def on_query_keyframe(self, parameters: dict[str, str]) -> Iterator[Image]:
-        """Yield the undistorted image of the keyframe `id` as a JPEG, from memory or from the session."""
-        self._check_map("keyframe")
-        id = keyframe_id_of(parameters)
-        keyframe = self._mapper.keyframes.get(id)
-        if keyframe is not None:
-            yield image_message(keyframe.levels[FULL].rgb.transpose(1, 2, 0))
-        elif id in self._mapper.paged_out and (message := self._session.read(id)) is not None:
-            yield image_message(keyframe_rgb(message, self._intake.undistorter))
-        else:
-            raise UserError(f"keyframe: id={id}: the image of this keyframe is not kept")
-
-    def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
-        """Yield the current state of the map, with the content of a checkpoint, in several messages."""
-        check_names("state", parameters, ())
-        self._check_map("state")
-        yield from state_messages(self._session.complete(arrays_of(self._mapper, self._intake.arrays())))
-
-    def _check_map(self, query: str) -> None:
-        if not self._intake.stored():
-            raise UserError(f"{query}: the map is still empty")
-
     # --- end of the data ---
 
     def drain(self) -> Outputs:
@@ -388,38 +262,3 @@ class MappingNode(Node):
             self._mapper.refine(self.config.final_steps, FULL)
             yield from self._publish_all()
         yield from self._save()
-
-    def _publish_all(self) -> Outputs:
-        """Publish all chunks that viewers do not have in full detail, and the poses of all keyframes."""
-        stamps_ns, T_map_body, ids = self._intake.poses()
-        last_ns = int(stamps_ns[-1])
-        census = ChunkCensus(self._mapper, None)  # in full detail
-        for anchor in census.versions:
-            yield from self._chunk(census, anchor, last_ns)
-        poses = MapPoses(stamp_ns=last_ns, keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body)
-        yield "mapping/poses", poses
-
-    def _save(self) -> Outputs:
-        """Write the last checkpoint; with the option `save`, also splats.ply and the keyframe poses."""
-        m, folder = self._mapper, self.config.save
-        stamps_ns, T_map_body, _ = self._intake.poses()
-        if (work := self._session.checkpoint(int(stamps_ns[-1]), last=True)) is not None:
-            if self.must_stop():  # the runner waits for a job as long as there is time
-                yield Job("checkpoint", work)
-            else:
-                self._session.finish_checkpoint(work())
-        if folder is not None:
-            degree, anchors = m.store.degree, list(m.store.paged_out)
-            on_disk = (part for anchor in anchors for part in disk_params(m, anchor, degree))
-            params_map = chain([m.store.with_harmonics()], on_disk)
-            count = m.store.count + m.store.paged_out_count
-            try:
-                write_map(folder, count, params_map, stamps_ns, T_map_body, 3 * coefficients(degree))
-            except (OSError, UserError) as error:
-                fault = f"mapping.save = {folder}: not written ({reason(error)})"
-                if self.live_settings is None:  # lockstep: nothing else continues
-                    raise UserError(fault) from error
-                self.detail = fault
-                log.error("%s", fault)
-                return
-            log.info("map of %d Gaussians saved to %s", count, folder)

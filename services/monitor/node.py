@@ -41,6 +41,8 @@ class MonitorConfig(NodeConfig):
     file. Rates are upper limits in measurement time; a rate of 0 disables the drawing.
     """
 
+    # Lower CPU priority than what it shows: on a busy machine the picture is late, not the robot.
+    nice: Annotated[int, Field(ge=0, le=19)] = 5
     view: Literal["none", "spawn", "serve"] = "serve"
     save: Path | None = None
     bind: str = "127.0.0.1"  # "0.0.0.0": anyone who can reach this machine can see it, without encryption

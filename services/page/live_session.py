@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import zenoh
 
-from beamsplat.common.messages import Health, Message
+from beamsplat.common.messages import Message
 from beamsplat.common.messages.header import DecodeError
 from beamsplat.common.topics import HEALTH, Topic, topic
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.health_samples import HEALTH_ROW, decode_health
 from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 
 # Of all robots; a full ring loses its oldest message, and never delays the session.
 _QUEUED, _QUEUED_HISTORY = 256, 4096
 _ROBOT = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")  # as in a deployment
-_HEALTH_ROW = Topic(HEALTH, Health, (), 1, "latest")
 
 
 class FleetSubscriptions:
@@ -47,7 +47,7 @@ class FleetSubscriptions:
         for name in topics:
             row = topic(name)
             self._subscribe(session, row, row.name, row.delivery)
-        self._subscribe(session, _HEALTH_ROW, f"{HEALTH}/*", "latest")
+        self._subscribe(session, HEALTH_ROW, f"{HEALTH}/*", "latest")
 
     def _subscribe(self, session: zenoh.Session, row: Topic, suffix: str, delivery: str) -> None:
         size = _QUEUED_HISTORY if row.history else _QUEUED
@@ -64,8 +64,14 @@ class FleetSubscriptions:
             self._on_refused("messages of other robots: the name is not that of a robot")
             return
         try:
-            message = decode_sample(sample, row).message
+            messages = _decode(sample, row)
         except DecodeError:
             self._on_refused("messages of other robots: not decodable")
             return
-        self._on_message(robot, row.name, message)
+        for message in messages:
+            self._on_message(robot, row.name, message)
+
+
+def _decode(sample: zenoh.Sample, row: Topic) -> Sequence[Message]:
+    """Return the message of a sample, or the health reports. Raises DecodeError if it does not decode."""
+    return decode_health(sample) if row.name == HEALTH else [decode_sample(sample, row).message]

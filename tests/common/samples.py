@@ -17,6 +17,7 @@ from beamsplat.common.messages import (
     Grid,
     GridTile,
     Health,
+    HealthBundle,
     Image,
     InputHealth,
     Keyframe,
@@ -143,6 +144,7 @@ def sample_messages() -> list[Message]:
             rejected=(Rejected(topic="fusion/depth", reason="N beams", count=9),), pid=10, status="lost: no match",
             figures=(NodeFigure(name="link_up", value=1.0),), clock_id=2**64 - 1,
         ),
+        HealthBundle(stamp_ns=32, packed=np.arange(90, dtype=np.uint8)),
         Answer(stamp_ns=31, text="depth was told to end, and starts again"),
     ]  # fmt: skip
 

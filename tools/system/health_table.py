@@ -14,14 +14,13 @@ from rich.table import Table
 from rich.text import Text
 
 from beamsplat.common.config.alerts import AlertConfig
-from beamsplat.common.messages import Health
 from beamsplat.common.messages.header import DecodeError, local_clock_id
 from beamsplat.common.runtime.alerts import Alert, AlertBook, AlertKey, conditions
 from beamsplat.common.runtime.health import HealthRecords, NodeRecord, TopicConsumer, TopicTraffic
-from beamsplat.common.topics import HEALTH, Topic
+from beamsplat.common.topics import HEALTH
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.health_samples import decode_health
 from beamsplat.common.zenoh.receiving import receive_in_thread
-from beamsplat.common.zenoh.streams import decode_sample
 
 ALL = "*"
 DEFAULT_RULES = AlertConfig()
@@ -51,7 +50,6 @@ class HealthTable:
         self.records: dict[str, NodeRecord] = self._book.records
         self._lock = threading.Lock()
         self._undecodable, self._last_fault = 0, ""  # reports that could not be decoded
-        self._row = Topic(HEALTH, Health, (), 1, "latest")
         self._subscriber = session.declare_subscriber(
             key(robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
         )
@@ -59,17 +57,17 @@ class HealthTable:
 
     def _receive(self, sample: zenoh.Sample) -> None:
         try:
-            health = decode_sample(sample, self._row).message
+            reports = decode_health(sample)
         except DecodeError as error:
             with self._lock:
                 self._undecodable, self._last_fault = self._undecodable + 1, f"{sample.key_expr}: {error}"
             return
-        assert isinstance(health, Health)  # the row's message type
         if self._all:
             whose = str(sample.key_expr).split("/")[1]
-            health = health.model_copy(update={"node": f"{whose}/{health.node}"})
+            reports = [h.model_copy(update={"node": f"{whose}/{h.node}"}) for h in reports]
         with self._lock:
-            self._book.add(health, self._clock_s())
+            for health in reports:
+                self._book.add(health, self._clock_s())
 
     def states(self) -> dict[str, str]:
         """Return the state of each node by name; "silent" if its last health message is too old."""

@@ -36,16 +36,19 @@ LOG_BYTES = 10_000_000  # at this size a log becomes the older part, which repla
 LOG_CHECK_S = 2.0
 
 # Two cores are shared by all services: no library may start a thread per core. Read by OpenMP, BLAS and
-# numba when they are first imported, hence set before the fork server starts.
+# numba when they are first imported, by glibc when a program starts, hence set before the fork server starts.
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
+# glibc's pools of memory for threads: by default eight per core, each with memory that was freed and not
+# returned. A node has about 30 threads, most of which receive the messages of one topic.
+FEW_ARENAS = {"MALLOC_ARENA_MAX": "2"}
 # Where Numba looks for compiled kernels, in this order: also on a disk that is full or read-only.
 _KERNEL_CACHES = (
     "beamsplat.common.kernel_cache.ReadableCacheLocator", "UserWideCacheLocator",
     "beamsplat.common.kernel_cache.UnwritableCacheLocator",
 )  # fmt: skip
-CHILD_ENVIRONMENT = {**ONE_THREAD, "NUMBA_CACHE_LOCATOR_CLASSES": ",".join(_KERNEL_CACHES)}
+CHILD_ENVIRONMENT = {**ONE_THREAD, **FEW_ARENAS, "NUMBA_CACHE_LOCATOR_CLASSES": ",".join(_KERNEL_CACHES)}
 
 
 def serve(

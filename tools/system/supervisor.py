@@ -6,15 +6,10 @@ nodes have been active once, it is an obstacle to the run if it is essential.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import multiprocessing
-import os
 import signal
-import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -24,8 +19,7 @@ from beamsplat.common.files.epochs import EpochClaims
 from beamsplat.common.files.persist import make_folder_if_possible
 from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.runtime.registry import Service
-from beamsplat.common.security.logins import OPERATOR, SUPERVISOR, login_of, make_logins
-from beamsplat.common.zenoh.bus import open_session
+from beamsplat.common.security.logins import OPERATOR, SUPERVISOR, make_logins
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.assembly import (
     Surroundings,
@@ -34,70 +28,14 @@ from beamsplat.tools.system.assembly import (
     service_of,
     surroundings,
 )
-from beamsplat.tools.system.log_tail import LogPosition, last_error, log_position
-from beamsplat.tools.system.node_process import CHILD_ENVIRONMENT, STOP_S, child
-from beamsplat.tools.system.shared_process import child_together
+from beamsplat.tools.system.child_processes import Child, ProcessStarter, Successor, end
+from beamsplat.tools.system.node_process import STOP_S
+from beamsplat.tools.system.router_checks import refuse_second_router, wait_for_router
 
 log = logging.getLogger("beamsplat")
 
 ROUTER = "router"
-BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0)
-RETRY_S = (5.0, 10.0, 30.0, 60.0)  # before the next start of a node that cannot run
-HEALTHY_S = 30.0  # a process that ran this long starts with the shortest back-off again
 START_UP_S = 300.0  # longest start-up, if a node never becomes active
-PRELOADED = (
-    "numpy",
-    "cv2",
-    "scipy.spatial",
-    "pydantic",
-    "zenoh",
-    "beamsplat.common.runtime.live",
-    "beamsplat.common.runtime.lockstep",
-)
-
-
-@dataclass
-class Child:
-    """State of one supervised node, or of the router; times are `time.monotonic()` in s.
-
-    Nodes that share a process (`Deployment.together`) have the same `process`. What is done to the process is
-    decided for the first of them only.
-    """
-
-    name: str
-    process: BaseProcess
-    started: float
-    identity: ProcessId
-    restarts: int = 0
-    attempts: int = 0  # within the current back-off
-    due: float | None = None  # time of the next start of a process that has ended
-    failed: str = ""  # why the last process could not run (UserError); "" = it runs, or has crashed
-    failures: int = 0  # UserErrors in a row
-    was_active: bool = False
-    retiring: bool = False  # hands over to a successor: its end is no crash
-    kill_at: float | None = None  # SIGTERM was sent for a restart; SIGKILL follows at this time
-
-    @property
-    def instance(self) -> str:
-        return self.identity.instance
-
-
-@dataclass
-class Successor:
-    """The process and the deployment that replace a running node.
-
-    Without a process, the node is first stopped and then started with the new options.
-    """
-
-    name: str
-    deployment: Deployment
-    process: BaseProcess | None = None
-    identity: ProcessId | None = None  # with a process
-    hands_over: bool = False  # loads the state that its predecessor saves, and publishes nothing before
-
-    @property
-    def instance(self) -> str:
-        return self.identity.instance if self.identity else ""
 
 
 class Supervisor:
@@ -119,23 +57,19 @@ class Supervisor:
         self.log_dir = deployment.run_dir / "logs"
         self.children: dict[str, Child] = {}
         self._around: dict[str, Surroundings] = {}
-        self._log_start: dict[str, LogPosition] = {}  # where the log of the newest process begins
         self._retired: list[BaseProcess] = []  # replaced processes, which end by themselves
         self._successors: list[BaseProcess] = []  # in standby
         self.table = table
         self._names = names if names is not None else (ROUTER, *deployment.nodes)
         self._on_event = on_event or (lambda text: log.info("%s", text))
-        self._claims = EpochClaims(deployment.run_dir, self._on_event)
+        self._starter = ProcessStarter(EpochClaims(deployment.run_dir, self._on_event), table)
         self.starting = True
         self.obstacle = ""  # why the run cannot go on: text for a UserError
         self._start_up_until = time.monotonic() + START_UP_S
-        os.environ.update({k: os.environ.get(k, v) for k, v in CHILD_ENVIRONMENT.items()})
-        _use_writable_temporary_folder()
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(list(PRELOADED))
 
     def __enter__(self) -> Supervisor:
-        self._refuse_second_router()  # before anything is created
+        if ROUTER in self._names:
+            refuse_second_router(self.deployment)  # before anything is created
         if fault := make_folder_if_possible(self.log_dir):
             self._on_event(f"{self.log_dir}: {fault}; the logs go to the output of this process")
         try:
@@ -153,9 +87,10 @@ class Supervisor:
         if ROUTER in self._names:
             if (folder := self.deployment.security.local) is not None:
                 make_logins(folder, (*self.table, *self.deployment.nodes, SUPERVISOR, OPERATOR))
-                self._refuse_second_router()  # now with a login
+                refuse_second_router(self.deployment)  # now with a login
             self._start(ROUTER)
-            self._wait_for_router()
+            process = self.children[ROUTER].process
+            wait_for_router(self.deployment, process.is_alive, lambda: self.last_error(ROUTER))
         classes = node_classes(self.deployment, self.table)
         nodes = [name for name in self._names if name != ROUTER]
         self._around = {name: surroundings(classes, name, self.deployment.role) for name in nodes}
@@ -171,74 +106,31 @@ class Supervisor:
         """Return the name of the process of a node: its own, or those of all nodes that share it."""
         return "+".join(self._sharing(name))
 
-    def _refuse_second_router(self) -> None:
-        if ROUTER in self._names and self._router_answers():
-            raise UserError(
-                f"a router already runs at {', '.join(self.deployment.router.listen)}: stop it, name the "
-                "nodes to run beside it (beamsplat run FILE NODE...), or choose another router.listen"
-            )
-
-    def _router_answers(self) -> bool:
-        with contextlib.suppress(UserError):
-            login = login_of(self.deployment.security, SUPERVISOR)
-            open_session(self.deployment.router.listen, wait_s=0.0, login=login).close()
-            return True
-        return False
-
-    def _wait_for_router(self) -> None:
-        router = self.children[ROUTER]
-        deadline = time.monotonic() + 20.0
-        while time.monotonic() < deadline:
-            if self._router_answers():
-                return
-            if not router.process.is_alive():
-                raise UserError(f"the router did not start: {self.last_error(ROUTER)}")
-            time.sleep(0.05)
-        raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
-
     def log_file(self, name: str) -> Path:
         """Return the path of the log file of the process of the node (or router) called `name`."""
         return self.log_dir / f"{self.process_name(name)}.log"
 
     def last_error(self, name: str) -> str:
         """Return the last error in the log of the newest process called `name`, in one line."""
-        return last_error(self.log_file(name), self._log_start.get(name))
+        return self._starter.last_error(name, self.log_file(name))
 
     def _start(self, name: str, resume: bool = False) -> None:
         names = self._sharing(name)
         if len(names) == 1:
             self._set_process(name, *self._spawn(self.deployment, name, resume))
             return
-        identities = {other: self._claims.claim(other) for other in names}
         around = {other: self._around[other] for other in names}
-        log_file = self.log_file(name)
-        self._log_start.update(dict.fromkeys(names, log_position(log_file)))
-        process = self._context.Process(
-            target=child_together,
-            args=(self.deployment, around, log_file, resume, self.table, identities),
-            name=self.process_name(name),
-            daemon=False,
+        process, identities = self._starter.start_together(
+            self.deployment, around, self.log_file(name), resume=resume
         )
-        process.start()
         for other, identity in identities.items():
             self._set_process(other, process, identity)
 
     def _spawn(
         self, deployment: Deployment, name: str, resume: bool = False, standby: bool = False
     ) -> tuple[BaseProcess, ProcessId]:
-        """Start a process; return the process and its identity on the bus."""
-        identity = self._claims.claim(name)
-        log_file = self.log_file(name)
-        self._log_start[name] = log_position(log_file)
-        around = self._around.get(name)
-        process = self._context.Process(
-            target=child,
-            args=(deployment, name, log_file, resume, around, self.table, identity, standby),
-            name=name,
-            daemon=False,
-        )
-        process.start()
-        return process, identity
+        around, log_file = self._around.get(name), self.log_file(name)
+        return self._starter.start(deployment, name, around, log_file, resume=resume, standby=standby)
 
     def _set_process(self, name: str, process: BaseProcess, identity: ProcessId) -> None:
         known = self.children.get(name)
@@ -377,10 +269,7 @@ class Supervisor:
             self._service(name).finite or (self.starting and self._is_essential(name)) for name in names
         ):
             self.obstacle = self.obstacle or text
-        if now - entry.started > HEALTHY_S:
-            entry.failures = 0
-        delay = RETRY_S[min(entry.failures, len(RETRY_S) - 1)]
-        entry.failures += 1
+        delay = entry.delay_after_failure_s(now)
         entry.due = now + delay
         if entry.failed != before and not self.obstacle:  # an obstacle is the error with which the run ends
             self._on_event(f"{text}; tried again in {delay:g} s")
@@ -392,10 +281,7 @@ class Supervisor:
             return
         for name in self._sharing(entry.name):
             self.children[name].failed = ""
-        if now - entry.started > HEALTHY_S:
-            entry.attempts = 0
-        delay = BACK_OFF_S[min(entry.attempts, len(BACK_OFF_S) - 1)]
-        entry.attempts += 1
+        delay = entry.delay_after_crash_s(now)
         entry.due = now + delay
         # A drained node runs until it is stopped, so with exit code 0 another program has stopped it.
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -405,31 +291,10 @@ class Supervisor:
     def stop(self) -> None:
         """Stop the nodes with SIGTERM, sources first, then the router; SIGKILL after `STOP_S`."""
         nodes = [c for c in self.children.values() if c.name != ROUTER]
-        _end(list(reversed(nodes)))
+        end(list(reversed(nodes)))
         for process in self._successors:
             process.kill()
         for process in self._retired:
             process.join(STOP_S)
             process.kill()
-        _end([c for c in self.children.values() if c.name == ROUTER])
-
-
-def _use_writable_temporary_folder() -> None:
-    """Let Python create the socket of its fork server in memory, if no disk has room for it."""
-    try:
-        tempfile.gettempdir()
-    except FileNotFoundError:
-        tempfile.tempdir = "/dev/shm"
-
-
-def _end(children: list[Child]) -> None:
-    for entry in children:
-        if entry.process.is_alive():
-            entry.process.terminate()
-    deadline = time.monotonic() + STOP_S
-    for entry in children:
-        entry.process.join(max(deadline - time.monotonic(), 0.0))
-        if entry.process.is_alive():
-            log.warning("%s did not stop within the time limit: killed", entry.name)
-            entry.process.kill()
-            entry.process.join()
+        end([c for c in self.children.values() if c.name == ROUTER])

@@ -35,6 +35,7 @@ from beamsplat.services.localization.lidar2d.map_saver import MapSaver
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
 from beamsplat.services.localization.lidar2d.state import MANIFEST, read_manifest
+from beamsplat.services.localization.lidar2d.warm import warm
 
 log = logging.getLogger("beamsplat.localization")
 
@@ -94,6 +95,8 @@ class LidarLocalization(Node):
         self._checkpoint_running = False
         self._fault = self._sensors = ""  # parts of the text of the health message
         live = self.live_settings
+        if live is not None:  # else the first scans wait a second for the kernels, and all images with them
+            warm()
         self._checkpoint_dir = None if live is None else live.run_dir / "localization"
         self._saver: MapSaver | None = None  # of checkpoints
         self._final_saver: MapSaver | None = None  # of the option `save`

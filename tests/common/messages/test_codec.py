@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from pydantic import BaseModel
 
 from beamsplat.common.messages import MESSAGES, Correction, Image, Rig, Scan
-from beamsplat.common.messages.codec import decode, encode, kept_payload, schema_of
+from beamsplat.common.messages.codec import decode, encode, encode_into, kept_payload, schema_of
 from beamsplat.common.messages.header import DecodeError, Header
 from tests.common.samples import assert_equal, sample_messages
 
@@ -44,6 +44,18 @@ def test_a_payload_is_kept_until_the_message_is_changed():
     assert "kept_payload" not in message.__dict__
     other = message.model_copy(update={"optimisation": 9})
     assert decode(schema_of(other), encode(other)).optimisation == 9
+
+
+def test_a_buffer_that_is_used_again_has_the_payload_of_each_message():
+    buffer = bytearray(b"of before")
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        for k in rng.permutation(len(SAMPLES)):
+            message = SAMPLES[k].model_copy()  # nothing is kept with it
+            assert encode_into(message, buffer) is buffer
+            assert buffer == encode(message)
+    kept = encode(message, keep=True)
+    assert encode_into(message, buffer) is kept
 
 
 def test_a_payload_of_another_version_is_not_kept():

@@ -3,19 +3,25 @@
 import contextlib
 import dataclasses
 import itertools
+import time
 
 import numpy as np
 import pytest
 
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
-from beamsplat.common.messages import Health, Odometry
+from beamsplat.common.messages import Health, HealthBundle, Odometry
+from beamsplat.common.messages.codec import encode
 from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.health_codec import pack_reports
 from beamsplat.common.runtime.mailbox import Mailbox
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.topics import TOPICS
 from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
+from beamsplat.common.zenoh.health_samples import BUNDLE_ENCODING
 from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
+from beamsplat.tools.system.health_table import HealthTable
+from tests.common.messages.test_health_codec import robot_reports
 from tests.common.polling import wait_until
 from tests.common.samples import sample_messages
 from tests.conftest import free_port
@@ -94,12 +100,88 @@ def test_ends_and_health_cross(sides):
     def crossed():
         robot.bus.publish_health(SAMPLES[Health])
         edge.bus.publish_health(SAMPLES[Health])
-        return {"end/tick", "health/producer"} <= edge.crossed and "health/producer" in robot.crossed
+        return {"end/tick", "health/bundle"} <= edge.crossed and "health/bundle" in robot.crossed
 
     wait_until(crossed)
     wait_until(lambda: bridge.ended == {"tick", "keyframes/ack"})
-    assert edge.crossed == {"end/tick", "health/producer"}
-    wait_until(lambda: robot.crossed == {"end/keyframes/ack", "health/producer"})
+    assert edge.crossed == {"end/tick", "health/bundle"}
+    wait_until(lambda: robot.crossed == {"end/keyframes/ack", "health/bundle"})
+
+
+def test_reports_of_a_side_cross_together_and_a_change_of_state_at_once(sides):
+    robot, edge, bridge, _ = sides
+    table = HealthTable(edge.open(), "r1")
+    reports = {name: _report(name) for name in ("camera", "depth", "fusion")}
+    nodes = {name: Bus(robot.open(), "r1", name, AT_ROBOT, 1) for name in reports}
+
+    def arrived():
+        for name, bus in nodes.items():
+            bus.publish_health(reports[name])
+        return table.states() == dict.fromkeys(reports, "active")
+
+    wait_until(arrived)
+    count = bridge.forwarded["health"]
+    before = count.messages
+    for _ in range(5):  # within less than a second, unless the machine is very busy
+        arrived()
+    wait_until(lambda: count.messages > before)
+    assert count.messages - before < 15
+    nodes["depth"].publish_health(reports["depth"].model_copy(update={"state": "drained"}))
+    wait_until(lambda: table.states()["depth"] == "drained")
+    assert table.records["fusion"].health.figures == reports["fusion"].figures
+
+
+def _report(node):
+    return SAMPLES[Health].model_copy(update={"node": node, "instance": AT_ROBOT, "epoch": 1})
+
+
+def test_a_robot_at_rest_needs_less_than_two_kilobytes_a_second(sides):
+    robot, edge, bridge, _ = sides
+    table = HealthTable(edge.open(), "r1")
+    nodes = [Bus(robot.open(), "r1", report.node, AT_ROBOT, 1) for report in robot_reports()]
+
+    def one_second(number):
+        for node, report in zip(nodes, robot_reports(number)):  # all counters and measurements change
+            node.publish_health(report.model_copy(update={"instance": AT_ROBOT}))
+        for tenth in range(10):
+            stamp_ns = number * 1_000_000_000 + tenth * 100_000_000
+            update = {"stamp_ns": stamp_ns, "T_odom_body": np.eye(4)}
+            robot.publications["localization/odometry"].put(SAMPLES[Odometry].model_copy(update=update))
+        robot.publications["tick"].put(SAMPLES[TOPICS["tick"].message])
+        time.sleep(1.0)
+
+    def sent_bytes():
+        return sum(traffic.bytes for traffic in bridge.forwarded.values())
+
+    numbers = itertools.count(1)
+    wait_until(lambda: one_second(next(numbers)) or len(table.states()) == len(nodes), 20.0)
+    before = sent_bytes()
+    for _ in range(3):
+        one_second(next(numbers))
+    assert 3 * 500 < sent_bytes() - before < 3 * 2000
+    assert set(table.states().values()) == {"active"}
+
+
+def test_a_node_cannot_report_the_health_of_others(sides):
+    robot, edge, _, _ = sides
+    table = HealthTable(edge.open(), "r1")
+    bundle = HealthBundle(stamp_ns=1, packed=pack_reports([_report("fusion")]))
+    header, node = (
+        Header(1, 1, 1, 0, 1, "depth", AT_ROBOT).pack(),
+        Bus(robot.open(), "r1", "depth", AT_ROBOT, 1),
+    )
+    kept = edge.open()
+
+    def refused():
+        for session in (kept, node.session):  # beside the bridge, and through it
+            session.put(
+                "beamsplat/r1/health/depth", encode(bundle), encoding=BUNDLE_ENCODING, attachment=header
+            )
+        node.publish_health(_report("depth"))
+        return "depth" in table.records and table._undecodable
+
+    wait_until(refused)
+    assert set(table.records) == {"depth"}
 
 
 def test_a_latched_message_of_before_the_bridge_crosses():

@@ -120,3 +120,15 @@ def test_the_status_says_how_many_keyframes_wait_on_the_robot():
     node.on_header(Header(frame.stamp_ns, 0, 0, 0, 1, "keyframes", "ab" * 8, 7))
     handle(node, "keyframes/frame", frame)
     assert node.detail.startswith("1 keyframes, 7 wait on the robot, ")
+
+
+def test_the_newest_keyframe_is_shown_however_late_it_is():
+    """Depth and link may need longer than the target; a keyframe behind which another waits is not shown."""
+    node = make_node()
+    list(node.handle_arrival("tick", Tick(stamp_ns=r.T0 + 10_000_000_000, count=0)))
+    for waiting, shown in ((None, 0), (2, None), (None, 2)):
+        if waiting is not None:
+            list(node.handle_arrival("keyframes/frame", message(waiting)))
+        number = 1 if shown is None else shown
+        previews = handle(node, "keyframes/frame", message(number)).get("mapping/preview", [])
+        assert [m.stamp_ns for m in previews] == ([] if shown is None else [message(shown).stamp_ns])
