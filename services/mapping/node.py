@@ -166,7 +166,7 @@ class MappingNode(MapQueries, MapOutputs):
         plan.owe("window", HALF, c.half_steps - half)
         plan.owe("window", FULL, c.full_steps - full)
         self._session.keep_budget()
-        if message.stamp_ns >= self._newest_keyframe_ns:
+        if delay_s < c.latency_s or message.stamp_ns >= self._newest_keyframe_ns:
             yield from self._show(message, outcome, loss)
             if len(self._mapper.keyframes) % c.chunk_every == 0:
                 census = ChunkCensus(self._mapper, self._viewpoint)
