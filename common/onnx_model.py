@@ -19,7 +19,10 @@ PROVIDERS = (
     "TensorrtExecutionProvider", "CUDAExecutionProvider", "OpenVINOExecutionProvider",
     "CoreMLExecutionProvider", "CPUExecutionProvider",
 )  # fmt: skip
-_DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
+_DTYPES = {
+    "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64,
+    "tensor(int64)": np.int64,  # of inputs that are numbers, not images
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class OnnxModel:
 
     def _tensor_spec(self, node: ort.NodeArg) -> TensorSpec:
         if node.type not in _DTYPES:
-            raise UserError(f"{self.path}: {node.name} is {node.type}; expected a float tensor")
+            raise UserError(f"{self.path}: {node.name} is {node.type}; expected a tensor of floats or int64")
         shape = tuple(size if isinstance(size, int) and size > 0 else None for size in node.shape)
         return TensorSpec(node.name, shape, np.dtype(_DTYPES[node.type]))
 
@@ -143,7 +146,7 @@ class OnnxModel:
             UserError: the network rejects the shape of an input.
         """
         feed = {
-            spec.name: np.ascontiguousarray(array, dtype=spec.dtype)
+            spec.name: np.asarray(array, dtype=spec.dtype, order="C")
             for spec, array in zip(self.inputs, arrays, strict=True)
         }
         try:

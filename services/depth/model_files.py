@@ -21,7 +21,7 @@ def models_dirs() -> list[Path]:
 def find_model(name: str | Path) -> Path:
     """Return the path of a model file.
 
-    `name`: an existing path, or `name` or `name.onnx` in one of the models folders.
+    `name`: an existing path, or `name`, `name.onnx` or `name/model.onnx` in one of the models folders.
 
     Raises:
         UserError: not found; the message contains the folders and how to obtain the file.
@@ -30,7 +30,9 @@ def find_model(name: str | Path) -> Path:
     if path.is_file():
         return path
     for folder in models_dirs():
-        for candidate in (folder / path.name, folder / f"{path.name}.onnx"):
+        for candidate in (
+            folder / path.name, folder / f"{path.name}.onnx", folder / path.name / "model.onnx",
+        ):  # fmt: skip
             if candidate.is_file():
                 return candidate
     sought = ", ".join(str(folder) for folder in models_dirs())

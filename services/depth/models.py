@@ -7,6 +7,7 @@ import tomllib
 import urllib.error
 import urllib.request
 from collections.abc import Callable
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
@@ -23,15 +24,23 @@ _BLOCK = 1 << 18
 _TIMEOUT_S = 30.0
 
 
+Url = Annotated[str, Field(pattern=r"^(https://.*|file://.*|http://127\.0\.0\.1[:/].*|)$")]
+Sha256 = Annotated[str, Field(pattern=r"^([0-9a-f]{64}|)$")]
+
+
 class ModelEntry(Config):
     """One row of `models.toml`: a model file that can be downloaded, with its licence and digest."""
 
     source: str  # the depth source that uses it
     licence: str
     commercial: bool  # the licence permits commercial use
-    url: Annotated[str, Field(pattern=r"^(https://.*|file://.*|http://127\.0\.0\.1[:/].*|)$")]
-    sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64}|)$")]  # "" = not verified
+    url: Url
+    sha256: Sha256  # "" = not verified
+    data_url: Url = ""  # a second file with the weights, which the first one names
+    data_sha256: Sha256 = ""
+    size_mb: float | None = None  # of all files; None = not known
     how: str = ""  # how to obtain the file, where there is no URL
+    note: str = ""  # what a user must know before the download
 
 
 def read_model_table(path: Path = TABLE) -> dict[str, ModelEntry]:
@@ -92,33 +101,74 @@ def pull(
     Raises:
         UserError: no URL, no agreement, no connection, or a wrong digest (the file is then removed).
     """
-    target = models_dirs()[0] / f"{name}.onnx"
-    if target.is_file() and row.sha256 and sha256_of(target) == row.sha256:
+    parts = files_of(name, row)
+    target = parts[0].path
+    if all(part.path.is_file() and part.sha256 and sha256_of(part.path) == part.sha256 for part in parts):
         return target
     if not row.url:
         raise UserError(f"{name}: there is no file to download. {row.how} Then copy it to {target}")
+    note = f" {row.note}" if row.note else ""
     if not row.commercial and not agree(
-        f"{name} has the licence {row.licence}: no commercial use. Continue?"
+        f"{name} has the licence {row.licence}: no commercial use.{note} Continue?"
     ):
         raise UserError(f"{name}: licence not accepted; nothing was downloaded")
     target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    _download(row.url, partial, progress)
-    digest = sha256_of(partial)
-    if row.sha256 and digest != row.sha256:
-        partial.unlink()
+    for part in parts:
+        _download(part.url, part.partial, progress)
+        _verify(name, part, agree)
+    for part in reversed(parts):  # the graph last: while it is missing, the model is not installed
+        os.replace(part.partial, part.path)
+    return target
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """One file of a model: where it comes from, and where it is installed."""
+
+    url: str
+    sha256: str
+    path: Path
+
+    @property
+    def partial(self) -> Path:
+        """Return the path of the file while it is downloaded."""
+        return self.path.with_name(self.path.name + ".partial")
+
+
+def files_of(name: str, row: ModelEntry) -> list[ModelFile]:
+    """Return the files of a model in the first models folder, the graph first.
+
+    A graph names its second file, which therefore keeps its name; both are in a folder called `name`.
+    """
+    folder = models_dirs()[0]
+    if not row.data_url:
+        return [ModelFile(row.url, row.sha256, folder / f"{name}.onnx")]
+    data = folder / name / row.data_url.rpartition("/")[2]
+    return [
+        ModelFile(row.url, row.sha256, folder / name / "model.onnx"),
+        ModelFile(row.data_url, row.data_sha256, data),
+    ]
+
+
+def _verify(name: str, part: ModelFile, agree: Callable[[str], bool]) -> None:
+    """Check the digest of a downloaded file; ask where there is none to compare with.
+
+    Raises:
+        UserError: another digest, or no agreement; the file is removed.
+    """
+    digest = sha256_of(part.partial)
+    if part.sha256 and digest != part.sha256:
+        part.partial.unlink()
         raise UserError(
-            f"{name}: the file from {row.url} has sha256 {digest}, the table states {row.sha256}; "
+            f"{name}: the file from {part.url} has sha256 {digest}, the table states {part.sha256}; "
             "the file was removed. Try again, or check the table"
         )
     question = (
         f"{name}: the downloaded file has sha256 {digest}; the table has none to compare with. Keep it?"
     )
-    if not row.sha256 and not agree(question):
-        partial.unlink()
+    if not part.sha256 and not agree(question):
+        part.partial.unlink()
         raise UserError(f"{name}: the file was not kept")
-    os.replace(partial, target)
-    return target
 
 
 def _download(url: str, partial: Path, progress: Callable[[int, int | None], None]) -> None:

@@ -65,13 +65,16 @@ SOURCES: dict[str, str] = {
     "unidepth": "beamsplat.services.depth.unidepth:UniDepth",
     "depth_anything": "beamsplat.services.depth.depth_anything:DepthAnything",
     "depth_anything_metric": "beamsplat.services.depth.depth_anything:DepthAnythingMetric",
+    "depth_anything_3": "beamsplat.services.depth.depth_anything_3:DepthAnything3",
+    "depth_anything_3_metric": "beamsplat.services.depth.depth_anything_3:DepthAnything3Metric",
+    "moge": "beamsplat.services.depth.moge:MoGe",
     "stixel": "beamsplat.services.depth.stixel:Stixel",
     "recorded": "beamsplat.services.depth.recorded:RecordedDepth",
     "none": "beamsplat.services.depth.no_depth:NoDepth",
 }
 
 # Sources that use the beams at the time of the image; the others do not wait for them.
-USES_BEAMS = frozenset({"stixel"})
+USES_BEAMS = frozenset({"stixel", "moge"})
 
 # Sources that do not use the image, so that it is not decoded for them.
 IGNORES_IMAGE = frozenset({"stixel", "recorded", "none"})

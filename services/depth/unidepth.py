@@ -77,13 +77,13 @@ class UniDepth:
                 f"{self._onnx.path}: pts_3d has shape {list(points.shape)}; expected 1 x 3 x H x W"
             )
         status = check_depth_map(points[0, 2])
-        z = _crop_and_resize(points[0, 2], fit, h, w)
+        z = crop_and_resize(points[0, 2], fit, h, w)
         with np.errstate(invalid="ignore"):
             z = np.where(z > 0.0, z, np.nan).astype(np.float32)
         confidence = None
         if self._has_confidence:
             # The export outputs an estimated log error: larger is worse. Only the order is used.
-            error = _crop_and_resize(results[1].reshape(points.shape[2:]), fit, h, w)
+            error = crop_and_resize(results[1].reshape(points.shape[2:]), fit, h, w)
             confidence = (1.0 / (1.0 + np.maximum(error, 0.0))).astype(np.float32)
         return Estimate(z, "metric", status, confidence)
 
@@ -117,6 +117,7 @@ def network_rays(camera: Pinhole, fit: LetterboxLayout, side: tuple[int, int]) -
     return (rays / np.linalg.norm(rays, axis=0))[None].astype(np.float32)
 
 
-def _crop_and_resize(values: np.ndarray, fit: LetterboxLayout, height: int, width: int) -> np.ndarray:
+def crop_and_resize(values: np.ndarray, fit: LetterboxLayout, height: int, width: int) -> np.ndarray:
+    """Return the image's part of a map at network size, resized bilinearly to float32 [height, width]."""
     inner = values[fit.top_px : fit.top_px + fit.height_px, fit.left_px : fit.left_px + fit.width_px]
     return cv2.resize(np.ascontiguousarray(inner), (width, height), interpolation=cv2.INTER_LINEAR)

@@ -179,7 +179,8 @@ def _models() -> Iterator[Finding]:
     from beamsplat.services.depth.model_files import models_dirs
 
     folders = models_dirs()
-    found = sorted({path.name for folder in folders for path in folder.glob("*.onnx")})
+    files = {path.name for folder in folders for path in folder.glob("*.onnx")}
+    found = sorted(files | {path.parent.name for folder in folders for path in folder.glob("*/model.onnx")})
     where = ", ".join(map(str, folders))
     if found:
         yield Finding("depth networks", "ok", f"{', '.join(found)} in {where}")

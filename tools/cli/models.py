@@ -31,13 +31,14 @@ def list_models(
         )
         return
     table = Table()
-    for title in ("name", "source", "licence", "installed", "how to get it"):
+    for title in ("name", "source", "licence", "MB", "installed", "how to get it"):
         table.add_column(title, overflow="fold")
     for name, row in rows.items():
         where = installed_path(name)
         way = f"beamsplat models pull {name}" if row.url else row.how
         licence = row.licence if row.commercial else f"{row.licence} (not commercial)"
-        table.add_row(name, row.source, licence, str(where) if where else "-", way)
+        size = "?" if row.size_mb is None else f"{row.size_mb:g}"
+        table.add_row(name, row.source, licence, size, str(where) if where else "-", way)
     Console().print(table)
 
 
@@ -50,13 +51,16 @@ def pull_model(
 ) -> None:
     """Download a model into the first folder of BEAMSPLAT_MODELS, or the user's data folder.
 
-    An interrupted download is resumed; the digest is checked before the file is installed.
+    An interrupted download is resumed; the digest is checked before the file is installed. A network that may
+    not be used commercially is downloaded only after you agree.
 
     Examples:
 
+        beamsplat models pull moge
+
         beamsplat models pull depth_anything_v2_small
 
-        beamsplat models pull depth_anything
+        beamsplat models pull --yes unidepth
     """
     from beamsplat.services.depth.models import model_name, pull, read_model_table
 
@@ -80,6 +84,8 @@ def pull_model(
         print(pull(name, row, agree, progress))
     finally:
         bar.stop()
+    if row.note:
+        Console(stderr=True).print(row.note, highlight=False)
 
 
 @app.command("check")

@@ -5,12 +5,15 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 
-def save(path, nodes, inputs, outputs, constants=()):
-    """Writes a graph; ports are (name, shape) with None for a free size."""
+def save(path, nodes, inputs, outputs, constants=(), types=None, data=None):
+    """Writes a graph; ports are (name, shape) with None for a free size, `types` those that are not float.
+
+    `data`: name of a second file for the constants, as exporters of large networks write it.
+    """
 
     def port(name, shape):
         dims = [f"{name}{i}" if size is None else size for i, size in enumerate(shape)]
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, dims)
+        return helper.make_tensor_value_info(name, (types or {}).get(name, TensorProto.FLOAT), dims)
 
     graph = helper.make_graph(
         nodes,
@@ -22,7 +25,10 @@ def save(path, nodes, inputs, outputs, constants=()):
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 14)])
     model.ir_version = 8
     onnx.checker.check_model(model)
-    onnx.save(model, path)
+    if data:
+        onnx.save(model, path, save_as_external_data=True, location=data, size_threshold=0)
+    else:
+        onnx.save(model, path)
     return path
 
 
@@ -79,3 +85,97 @@ def unidepth(path, side=(28, 42), with_rays=True):
             ("K", np.eye(3, dtype=np.float32)[None]),
         ],
     )
+
+
+def moge(
+    path, side=(None, None), tokens=True, outputs=("points", "normal", "mask", "metric_scale"), seen=False
+):
+    """MoGe-2, whose image brings what a network would find in it.
+
+    Red is (x / z + 1) / 2, green (y / z + 1) / 2, blue z / 8. Output: points = (x, y, z - 0.75) in units of
+    1.25 m, mask = 0.9, but 0.1 where blue is 0. `seen`: metric_scale is num_tokens / 1000, to read it off.
+    """
+    h, w = side
+    inputs = [("image", (None, 3, h, w))]
+    nodes = [
+        helper.make_node("Split", ["image"], ["red", "green", "blue"], axis=1),
+        helper.make_node("Mul", ["blue", "eight"], ["z"]),
+        helper.make_node("Mul", ["red", "two"], ["red2"]),
+        helper.make_node("Sub", ["red2", "one"], ["ray_x"]),
+        helper.make_node("Mul", ["green", "two"], ["green2"]),
+        helper.make_node("Sub", ["green2", "one"], ["ray_y"]),
+        helper.make_node("Mul", ["ray_x", "z"], ["x"]),
+        helper.make_node("Mul", ["ray_y", "z"], ["y"]),
+        helper.make_node("Sub", ["z", "shift"], ["z_shifted"]),
+        helper.make_node("Concat", ["x", "y", "z_shifted"], ["xyz"], axis=1),
+        helper.make_node("Transpose", ["xyz"], ["points"], perm=[0, 2, 3, 1]),
+        helper.make_node("Identity", ["points"], ["normal"]),
+        helper.make_node("Greater", ["blue", "zero"], ["there"]),
+        helper.make_node("Cast", ["there"], ["there_f"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", ["there_f", "most"], ["mask4"]),
+        helper.make_node("Add", ["mask4", "least"], ["mask5"]),
+        helper.make_node("Squeeze", ["mask5", "axis1"], ["mask"]),
+    ]
+    if tokens:
+        inputs.append(("num_tokens", ()))
+    if tokens and seen:
+        nodes += [
+            helper.make_node("Cast", ["num_tokens"], ["tokens_f"], to=TensorProto.FLOAT),
+            helper.make_node("Mul", ["tokens_f", "thousandth"], ["tokens_1"]),
+            helper.make_node("Reshape", ["tokens_1", "axis1"], ["metric_scale"]),
+        ]
+    else:
+        nodes.append(helper.make_node("Identity", ["scale"], ["metric_scale"]))
+    shapes = {
+        "points": (None, h, w, 3), "normal": (None, h, w, 3), "mask": (None, h, w), "metric_scale": (None,),
+    }  # fmt: skip
+    constants = [
+        ("eight", np.float32(8.0)), ("two", np.float32(2.0)), ("one", np.float32(1.0)),
+        ("zero", np.float32(0.0)), ("shift", np.float32(0.75)), ("most", np.float32(0.8)),
+        ("least", np.float32(0.1)), ("thousandth", np.float32(1e-3)), ("axis1", np.array([1], np.int64)),
+        ("scale", np.array([1.25], np.float32)),
+    ]  # fmt: skip
+    return save(
+        path,
+        nodes,
+        inputs,
+        [(name, shapes[name]) for name in outputs],
+        constants,
+        {"num_tokens": TensorProto.INT64},
+    )
+
+
+def depth_anything_3(
+    path, side=(None, None), views=True, names=("predicted_depth", "confidence"), sky=False, data=None
+):
+    """Depth = mean of the normalised channels + 3, confidence = 3; with views [1, N, 3, h, w], as DA3 exports.
+
+    With `sky`, sky = 1 where the depth is above 4.5.
+    """
+    h, w = side
+    shape = (None, None, 3, h, w) if views else (None, 3, h, w)
+    out = (None, None, h, w)
+    nodes = [
+        helper.make_node(
+            "ReduceMean", ["pixel_values"], ["mean"], axes=[2 if views else 1], keepdims=int(not views)
+        ),
+        helper.make_node("Add", ["mean", "three"], [names[0]]),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+        helper.make_node("Add", ["nothing", "three"], [names[1]]),
+    ]
+    outputs = [(names[0], out), (names[1], out)]
+    if views:
+        nodes += [helper.make_node("Identity", [n], [n[:-2]]) for n in ("extrinsics_c", "intrinsics_c")]
+        outputs += [("extrinsics", (1, 1, 3, 4)), ("intrinsics", (1, 1, 3, 3))]
+    if sky:
+        nodes += [
+            helper.make_node("Greater", [names[0], "high"], ["above"]),
+            helper.make_node("Cast", ["above"], ["sky"], to=TensorProto.FLOAT),
+        ]
+        outputs.append(("sky", out))
+    constants = [
+        ("three", np.float32(3.0)), ("zero", np.float32(0.0)), ("high", np.float32(4.5)),
+        ("extrinsics_c", np.eye(4, dtype=np.float32)[None, None, :3]),
+        ("intrinsics_c", np.eye(3, dtype=np.float32)[None, None]),
+    ]  # fmt: skip
+    return save(path, nodes, [("pixel_values", shape)], outputs, constants, data=data)

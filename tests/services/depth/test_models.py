@@ -6,32 +6,36 @@ import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.services.depth.model_files import find_model, sha256_of
 from beamsplat.services.depth.models import ModelEntry, find_entry, model_name, pull, read_model_table
-from beamsplat.services.depth.source import SOURCES, source_class
+from beamsplat.services.depth.source import SOURCES, DepthInput, make_source, source_class
 
 DATA = bytes(range(256)) * 4000
 
 
 class _Ranges(SimpleHTTPRequestHandler):
-    """Serves a file, in parts where asked."""
+    """Serves files, in parts where asked."""
 
     asked: list[str] = []
+    files: dict[str, bytes] = {}
 
     def do_GET(self):
         range_ = self.headers.get("Range")
         self.asked.append(range_ or "")
+        content = self.files[self.path.lstrip("/")]
         start = int(range_.removeprefix("bytes=").split("-")[0]) if range_ else 0
-        if start >= len(DATA):
+        if start >= len(content):
             self.send_error(416)
             return
         self.send_response(206 if range_ else 200)
-        self.send_header("Content-Length", str(len(DATA) - start))
+        self.send_header("Content-Length", str(len(content) - start))
         self.end_headers()
-        self.wfile.write(DATA[start:])
+        self.wfile.write(content[start:])
 
     def log_message(self, *_):
         pass
@@ -39,7 +43,7 @@ class _Ranges(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def server():
-    _Ranges.asked = []
+    _Ranges.asked, _Ranges.files = [], {"net.onnx": DATA}
     with ThreadingHTTPServer(("127.0.0.1", 0), _Ranges) as running:
         threading.Thread(target=running.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{running.server_port}/net.onnx"
@@ -136,18 +140,69 @@ def test_the_commands_take_the_name_of_a_source(folder):
 
     from beamsplat.tools.cli.main import app
 
-    with pytest.raises(
-        UserError, match=r"unidepth_v2_vits: there is no file to download.*unidepth_v2_vits.onnx"
-    ):
-        CliRunner().invoke(app, ["models", "pull", "unidepth"], catch_exceptions=False)
+    metric = "depth_anything_v2_metric_hypersim_small"
+    with pytest.raises(UserError, match=rf"{metric}: there is no file to download.*{metric}.onnx"):
+        CliRunner().invoke(app, ["models", "pull", "depth_anything_metric"], catch_exceptions=False)
     with pytest.raises(UserError, match="model 'unidepth_v2_vits' is not in"):
         CliRunner().invoke(app, ["models", "check", "unidepth"], catch_exceptions=False)
+
+
+def test_unidepth_is_not_downloaded_without_agreement(folder):
+    from typer.testing import CliRunner
+
+    from beamsplat.tools.cli.main import app
+
+    with pytest.raises(UserError, match="licence not accepted; nothing was downloaded"):
+        CliRunner().invoke(app, ["models", "pull", "unidepth"], input="n\n", catch_exceptions=False)
+    assert not list(folder.iterdir())
+
+
+def test_a_network_with_its_weights_in_a_second_file_runs_after_the_download(server, folder, tmp_path):
+    """As onnx-community exports Depth Anything 3: the graph names `model.onnx_data`."""
+    pytest.importorskip("onnx", reason="needs the package onnx, which builds the graphs")
+    from tests.services.depth import graphs
+
+    made = tmp_path / "made"
+    made.mkdir()
+    graphs.depth_anything_3(made / "model.onnx", data="model.onnx_data")
+    _Ranges.files = {path.name: path.read_bytes() for path in made.iterdir()}
+    assert set(_Ranges.files) == {"model.onnx", "model.onnx_data"}
+    base = server.rpartition("/")[0]
+    row = _row(
+        source="depth_anything_3", url=f"{base}/model.onnx", sha256=sha256_of(made / "model.onnx"),
+        data_url=f"{base}/model.onnx_data", data_sha256=sha256_of(made / "model.onnx_data"),
+    )  # fmt: skip
+    path = pull("da3", row, agree=lambda _: False)
+    assert path == find_model("da3") == folder / "da3" / "model.onnx"
+    image = np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8)
+    view = DepthInput(1, image, Pinhole(100.0, 100.0, 63.5, 47.5, 128, 96))
+    assert make_source("depth_anything_3", {"model": "da3", "input_px": 28}).estimate(view).ok
+    asked = len(_Ranges.asked)
+    pull("da3", row, agree=lambda _: False)
+    assert len(_Ranges.asked) == asked  # both are here already
+
+    broken = row.model_copy(update={"data_sha256": "0" * 64})
+    with pytest.raises(UserError, match=r"model\.onnx_data has sha256"):
+        pull("other", broken, agree=lambda _: True)
+    with pytest.raises(UserError, match="is not in"):
+        find_model("other")  # half of a network is not installed
+
+
+def test_the_list_names_size_and_licence():
+    from typer.testing import CliRunner
+
+    from beamsplat.tools.cli.main import app
+
+    text = CliRunner().invoke(app, ["models", "list"], env={"COLUMNS": "220"}).output
+    row = next(line for line in text.splitlines() if "moge_2_vits_normal" in line)
+    assert "MIT" in row
+    assert "141" in row
 
 
 def test_the_models_that_the_documents_pull_can_be_pulled():
     root = Path(__file__).resolve().parents[3]
     table, named = read_model_table(), set()
-    for page in (root / "README.md", *(root / "docs").glob("*.md")):
+    for page in (root / "README.md", *(root / "docs").rglob("*.md")):
         named |= set(re.findall(r"models pull (?:--yes )?([a-z0-9_]+)", page.read_text()))
     assert named
     for name in named:
