@@ -16,11 +16,11 @@ def check_aggregation(name: AggregationName, weights: Path | None, method: str) 
     """Check the options of the fusion service that choose the aggregation, without reading the weights.
 
     Raises:
-        UserError: "learned" without an existing weights file, or with another method than "field".
+        UserError: "learned" without an existing weights file, or with a method without a plane sweep.
     """
     if name == "sgm":
         return
-    if method != "field":
+    if method not in ("field", "poisson"):
         raise UserError(
             f'fusion.aggregation = "learned" has no effect with fusion.method = "{method}": set the method '
             'to "field", or the aggregation to "sgm"'

@@ -1,4 +1,4 @@
-"""Fusion by method `field`: metric depth and its standard deviation from image, pose, beams and estimate."""
+"""Fusion by methods `field` and `poisson`: metric depth and its sigma from image, pose, beams, estimate."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.depth_sigma import BETWEEN_KEYFRAMES, OF_KEYFRAMES, stated_sigma_log
 from beamsplat.services.fusion import upsample
 from beamsplat.services.fusion.aggregation import Aggregation
+from beamsplat.services.fusion.completion import completed_sweep
 from beamsplat.services.fusion.input_checks import ImageCheck, check_beams
 from beamsplat.services.fusion.inputs import (
     FusionInput,
@@ -65,6 +66,8 @@ class SweptKeyframe:
 
     task: KeyframeTask
     result: FusionResult
+    swept: SweepResult  # at the working size
+    sigma_log: np.ndarray  # float32 [h, w]: standard deviation of its log depth
 
 
 class Fusion:
@@ -73,13 +76,18 @@ class Fusion:
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
         config: PlaneSweepConfig | None = None, aggregation: Aggregation | None = None,
+        completes: bool = False,
     ) -> None:  # fmt: skip
-        """Prepare fusion for one camera; arguments as in `PlaneSweep`."""
+        """Prepare fusion for one camera; arguments as in `PlaneSweep`.
+
+        `completes`: method `poisson`. The depth of keyframes is completed with the gradients of the estimate.
+        """
         self._sweep = PlaneSweep(
             camera, T_body_camera, floor_known=floor_known, planar=planar, config=config,
             aggregation=aggregation,
         )  # fmt: skip
         self._planar = planar
+        self._completes = completes
         self._image_check = ImageCheck()
 
     def add_scan(self, points_map_m: np.ndarray) -> None:
@@ -142,9 +150,20 @@ class Fusion:
             swept, surfaces = self._sweep.sweep(task)
             sigma_log = self._sweep_sigma_log(swept, surfaces)
             self._pin_to_beams(swept, sigma_log, surfaces)
-            return SweptKeyframe(task, self._to_full_size(examined, swept, sigma_log, keyframe=True))
+            if self._completes:
+                swept, sigma_log = completed_sweep(examined.frame, swept, sigma_log)
+            result = self._to_full_size(examined, swept, sigma_log, keyframe=True)
+            return SweptKeyframe(task, result, swept, sigma_log)
 
         return run
+
+    def complete(self, examined: ExaminedImage, swept: SweptKeyframe) -> FusionResult:
+        """Return the depth of a swept keyframe by method `poisson`, for comparison with `swept.result`.
+
+        Without an estimate, or if the swept depth contradicts it, both are the same.
+        """
+        depth, sigma_log = completed_sweep(examined.frame, swept.swept, swept.sigma_log)
+        return self._to_full_size(examined, depth, sigma_log, keyframe=True)
 
     def finish_keyframe(self, swept: SweptKeyframe) -> FusionResult:
         """Use the depth of a keyframe for later images, and return it."""

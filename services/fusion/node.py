@@ -57,13 +57,14 @@ _CHECK_AFTER_SCANS = 100  # result of the calibration check after 10 s at 10 Hz;
 class FusionConfig(NodeConfig):
     """Options of fusion: method and properties of the robot."""
 
-    # field: plane sweep with all priors; ratio: the paper's one factor per image; affine: scale and shift of
-    # inverse depth; given: the estimate unchanged (robots without a lidar).
-    method: Remote[Literal["field", "ratio", "affine", "given"]] = "field"
+    # field: plane sweep with all priors; poisson: its keyframes completed with the gradients of the estimate
+    # (of a network); ratio: the paper's one factor per image; affine: scale and shift of inverse depth;
+    # given: the estimate unchanged (robots without a lidar).
+    method: Remote[Literal["field", "poisson", "ratio", "affine", "given"]] = "field"
     floor_known: Remote[bool] = True  # the camera height in the calibration is reliable
     planar: Remote[bool] = True  # the body stays level on a floor
     cloud_every_px: Remote[int] = 4  # pixels per point of the cloud, in each direction
-    # Of the plane sweep (method `field`). sgm: semi-global matching; learned: a network.
+    # Of the plane sweep (`field`, `poisson`). sgm: semi-global matching; learned: a network.
     aggregation: Remote[AggregationName] = "sgm"
     aggregation_weights: Path | None = None  # for "learned": a file of `beamsplat train aggregator`
     check_pairs: Remote[int] = Field(60, ge=0)  # image pairs for the check of the calibration; 0 = none
@@ -139,13 +140,13 @@ class FusionNode(Node):
         self._undistort = Undistorter(Pinhole.of(camera))
         self._T_body_camera = camera.T_body_camera
         self._history = SensorHistory(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
-        if method != "field":
+        if method != "field" and method != "poisson":
             self._fusion = SingleImageFusion(self._undistort.pinhole, camera.T_body_camera, method)
             self._work = ImageWork(self._fusion)
             return iter(())
         self._fusion = Fusion(
             self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
-            planar=self.config.planar, aggregation=self._aggregation,
+            planar=self.config.planar, aggregation=self._aggregation, completes=method == "poisson",
         )  # fmt: skip
         self._work = ImageWork(self._fusion)  # unfinished work of another odom frame or rig is dropped
         assert rig.lidar is not None  # checked above

@@ -114,7 +114,7 @@ def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -
     if len(pairs) < MIN_PAIRS:
         return rejected(values.shape, _too_few(len(uv_px), len(pairs)))
     q, y = 1.0 / pairs.estimate, 1.0 / pairs.z_m
-    a, b, weight = _robust_line(q, y)
+    a, b, weight = robust_line(q, y)
     if not a > 0.0:
         return rejected(
             values.shape,
@@ -142,7 +142,7 @@ def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -
     )  # fmt: skip
 
 
-def _robust_line(q: np.ndarray, y: np.ndarray) -> tuple[float, float, np.ndarray]:
+def robust_line(q: np.ndarray, y: np.ndarray) -> tuple[float, float, np.ndarray]:
     """Return (a, b, weights [N]) of the robust fit y = a q + b."""
     order = np.argsort(q, kind="stable")
     half = len(q) // 2

@@ -24,7 +24,7 @@ from beamsplat.services.fusion.learned_kernels import decode_depth, quantised_co
 def warm() -> None:
     """Run every kernel once on noise images in front of a wall, so that all are compiled in advance."""
     camera = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
-    fusion = Fusion(camera, camera_mount(0.1, 0.0, 0.45), floor_known=True, planar=True)
+    fusion = Fusion(camera, camera_mount(0.1, 0.0, 0.45), floor_known=True, planar=True, completes=True)
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (480, 640, 3)).astype(np.uint8)
     y = np.linspace(-2.0, 2.0, 200)

@@ -32,13 +32,14 @@ def print_depth_report(report: dict[str, Any]) -> None:
         table.add_row(key, *(_text(report[name].get(key)) for name in names))
     console.print(table)
     breakdown = report["breakdown"]
-    methods = [name for name in (report["default"], "learned") if name in breakdown["methods"]]
+    methods = [name for name in (report["default"], "poisson", "learned") if name in breakdown["methods"]]
     _print_intervals(console, breakdown, methods)
-    for name in methods:
+    for name in (name for name in methods if name != "poisson"):
         _print_parts(console, name, breakdown["methods"][name])
     console.print(_heights_line(breakdown["heights"]), highlight=False, markup=False, soft_wrap=True)
-    if "comparison" in report:
-        _print_comparison(console, report["comparison"])
+    for key in ("comparison", "poisson_comparison"):
+        if key in report:
+            _print_comparison(console, report[key])
     print("CPU ms per image: " + ", ".join(f"{k} {v:.1f}" for k, v in report["cpu_ms"].items()))
 
 

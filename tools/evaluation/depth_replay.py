@@ -15,7 +15,7 @@ from beamsplat.common.geometry.transforms import inverse
 from beamsplat.services.depth.recorded import read_depth
 from beamsplat.services.depth.source import DepthInput, DepthSource, Estimate
 from beamsplat.services.fusion.aggregation import Aggregation
-from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.fuse import ExaminedImage, Fusion, SweptKeyframe
 from beamsplat.services.fusion.inputs import FusionInput, PlaneSweepConfig
 from beamsplat.services.fusion.result import FusionResult, rejected
 from beamsplat.services.fusion.scaling import affine, ratio
@@ -65,7 +65,7 @@ def replay_depth(
 
     An image is processed without later data, except the scan during which it was taken. Wanted images are
     processed as keyframes (method `field`). Method `field_carried` is the depth of the same image if it were
-    not a keyframe: then only earlier keyframes contribute.
+    not a keyframe: then only earlier keyframes contribute. Method `poisson` completes the depth of `field`.
 
     Args:
         wanted: stamps of the wanted images, each with the file of its true depth, or None.
@@ -152,11 +152,19 @@ class _Replay:
         estimate, frame, source_s = self._estimated(stamp_ns, rgb, T_map_body, beams)
         seconds = {"source": source_s}
         methods: dict[str, FusionResult] = {}
-        for name in ("field_carried", *self._fusions):
-            fusion = self._fusions[name.removesuffix("_carried")]
+        started = time.process_time()
+        methods["field_carried"] = self._fusions["field"].fuse(frame, keyframe=False)
+        seconds["field_carried"] = time.process_time() - started
+        for name, fusion in self._fusions.items():
             started = time.process_time()
-            methods[name] = fusion.fuse(frame, keyframe=name in self._fusions)
+            examined = fusion.examine(frame, keyframe=True)
+            swept = examined if isinstance(examined, FusionResult) else fusion.begin_keyframe(examined)()
+            methods[name] = swept if isinstance(swept, FusionResult) else fusion.finish_keyframe(swept)
             seconds[name] = time.process_time() - started
+            if name == "field":
+                started = time.process_time()
+                methods["poisson"] = _completed(fusion, frame, examined, swept)
+                seconds["poisson"] = time.process_time() - started
         self._last_keyframe = T_map_body
         uv, z, _ = project_beams(beams, self._drive.undistort.pinhole, self._drive.T_body_camera)
         for name, correct in (("ratio", ratio), ("affine", affine)):
@@ -183,6 +191,18 @@ class _Replay:
         seconds = time.process_time() - started
         values = estimate.values if estimate.ok and estimate.kind != "none" else None
         return estimate, FusionInput(stamp_ns, rgb, T_map_body, beams, values, estimate.kind), seconds
+
+
+def _completed(
+    fusion: Fusion, frame: FusionInput, examined: ExaminedImage | FusionResult,
+    swept: SweptKeyframe | FusionResult,
+) -> FusionResult:  # fmt: skip
+    """Return the depth of a keyframe by method `poisson`; no depth without a sweep or an estimate."""
+    if isinstance(examined, FusionResult) or isinstance(swept, FusionResult):
+        return rejected(frame.image_rgb.shape[:2], "there is no plane sweep to complete")
+    if frame.estimate is None:
+        return rejected(frame.image_rgb.shape[:2], "there is no depth estimate")
+    return fusion.complete(examined, swept)
 
 
 def _moved(T_before: np.ndarray, T_now: np.ndarray) -> bool:

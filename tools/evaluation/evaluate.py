@@ -25,6 +25,7 @@ from beamsplat.tools.evaluation.metrics import (
 from beamsplat.tools.evaluation.truth_labels import TruthLabels
 
 DEFAULT = "field"
+COMPARED = {"learned": "comparison", "poisson": "poisson_comparison"}  # method -> its key in the report
 
 
 def evaluate(
@@ -41,8 +42,9 @@ def evaluate(
     """Evaluate the depth of a drive; return the JSON report of `beamsplat eval depth`.
 
     The report contains one object of metrics per method, the name of the `default` method, and `breakdown`:
-    errors by parts of the image with confidence intervals (see `DepthBreakdown`). With `learned` also
-    `comparison`: the change from method `field` to method `learned` on the pixels that both answer.
+    errors by parts of the image with confidence intervals (see `DepthBreakdown`). `poisson_comparison` is
+    the change from method `field` to method `poisson` on the pixels that both answer; with `learned`,
+    `comparison` is that to method `learned`.
 
     Args:
         truth: files of the true depth, by stamp of the image.
@@ -85,7 +87,7 @@ class _Figures:
         self._drive, self._labels = drive, labels
         self._errors: dict[str, MethodErrors] = {}
         self._breakdowns: dict[str, DepthBreakdown] = {}
-        self._pairs: PairedErrors | None = None
+        self._pairs: dict[str, PairedErrors] = {}  # by method that is compared with the default
         self._beams: dict[str, tuple[int, int]] = {}  # by run: held-out beams, those not confirmed by truth
         self._seconds: dict[str, list[float]] = {}
 
@@ -103,9 +105,11 @@ class _Figures:
         for name, value in outcome.seconds.items():
             self._seconds.setdefault(name, []).append(value)
         methods = outcome.methods
-        if "learned" in methods:
-            self._pairs = self._pairs or PairedErrors()
-            self._pairs.add(methods[DEFAULT].depth_m, methods["learned"].depth_m, outcome.truth)
+        for name in COMPARED:
+            if name not in methods or (name == "poisson" and outcome.estimate.kind == "none"):
+                continue
+            pairs = self._pairs.setdefault(name, PairedErrors())
+            pairs.add(methods[DEFAULT].depth_m, methods[name].depth_m, outcome.truth)
 
     def add_held(self, run: str, outcome: DepthComparison, heldout_mask: Callable[[int], np.ndarray]) -> None:
         """Add an image for which some beams were held out."""
@@ -122,8 +126,8 @@ class _Figures:
         report: dict[str, object] = {name: e.summary(excluded) for name, e in self._errors.items()}
         report["cpu_ms"] = {name: 1e3 * float(np.median(values)) for name, values in self._seconds.items()}
         report["breakdown"] = breakdown_report(self._breakdowns, self._labels.heights_report)
-        if self._pairs is not None:
-            report["comparison"] = {"first": DEFAULT, "second": "learned", **self._pairs.report()}
+        for name, pairs in self._pairs.items():
+            report[COMPARED[name]] = {"first": DEFAULT, "second": name, **pairs.report()}
         return report
 
 
