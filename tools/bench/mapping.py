@@ -135,17 +135,19 @@ def run_bench(
 
 
 def map_and_score(
-    recording: TruthDataset, bench: MapBenchSettings, prior: Prior, true_surface_m: np.ndarray | None = None
-) -> tuple[dict[str, float | None], MapperTimer]:
+    recording: TruthDataset, bench: MapBenchSettings, prior: Prior, true_surface_m: np.ndarray | None = None,
+    *, surface: bool = True,
+) -> tuple[dict[str, float | None], MapperTimer]:  # fmt: skip
     """Map a recording without refinement; return the scores of the map by name, and the computing time.
 
     Args:
         true_surface_m: points of the true surface in the map frame, float64 [N, 3]; None reads gt_surface.ply
             of the recording.
+        surface: also compute the F-score of the surface.
     """
     mapper, timer = Mapper(bench.settings, seed=bench.seed, threads=bench.threads), MapperTimer()
     _map_drive(recording, mapper, bench, prior, None, timer, lambda text: None)
-    return score_map(recording, mapper, lambda text: None, true_surface_m), timer
+    return score_map(recording, mapper, lambda text: None, true_surface_m, surface=surface), timer
 
 
 def _map_drive(
@@ -236,8 +238,9 @@ def make_keyframe(
 
 
 def score_map(
-    recording: TruthDataset, mapper: Mapper, log: Log, true_surface_m: np.ndarray | None = None
-) -> dict[str, float | None]:
+    recording: TruthDataset, mapper: Mapper, log: Log, true_surface_m: np.ndarray | None = None,
+    *, surface: bool = True,
+) -> dict[str, float | None]:  # fmt: skip
     """Return the scores of the map at held-out views by name: PSNR, SSIM, depth error, F-score, map size.
 
     A score is None if the recording has no views for it.
@@ -245,6 +248,7 @@ def score_map(
     Args:
         true_surface_m: points of the true surface in the map frame, float64 [N, 3]; None reads gt_surface.ply
             of the recording. If that file is missing too, there is no F-score.
+        surface: False leaves the F-score out.
     """
     log("scoring")
     camera = raster_camera(recording.camera)
@@ -262,10 +266,10 @@ def score_map(
         "depth_l1_offpath_m": _mean(off, "depth_l1_m"), "psnr_heldout_db": _mean(held, "psnr_db"),
         "ssim_heldout": _mean(held, "ssim"), "gaussians": mapper.store.count,
     }  # fmt: skip
-    surface = recording.path / "gt_surface.ply"
-    if true_surface_m is None and surface.is_file():
-        true_surface_m = read_ply_points(surface)
-    if true_surface_m is not None:
+    surface_file = recording.path / "gt_surface.ply"
+    if surface and true_surface_m is None and surface_file.is_file():
+        true_surface_m = read_ply_points(surface_file)
+    if surface and true_surface_m is not None:
         half = camera.resized(camera.width_px // 2, camera.height_px // 2)
         views = [(half, mapper.T_map_camera(held)) for held in mapper.keyframes.values()]
         points_m = fused_surface(lambda c, T: rgb_depth_alpha(mapper.render(c, T)), views)

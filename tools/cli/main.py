@@ -16,6 +16,7 @@ from beamsplat.common.errors import NothingUseful, UserError
 from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.tools.cli import bench as bench_cli
 from beamsplat.tools.cli import bench_endurance as endurance_cli
+from beamsplat.tools.cli import bench_geometry as geometry_cli
 from beamsplat.tools.cli import bench_mapping as mapping_cli
 from beamsplat.tools.cli import bug_report, demo, doctor, warm
 from beamsplat.tools.cli import calibrate as calibrate_cli
@@ -84,6 +85,7 @@ bench_cli.app.command("depth")(depth_cli.bench_depth)
 bench_cli.app.command("raster")(mapping_cli.bench_raster)
 bench_cli.app.command("gpu")(mapping_cli.bench_gpu)
 bench_cli.app.command("map")(mapping_cli.bench_map)
+bench_cli.app.command("geometry")(geometry_cli.bench_geometry)
 bench_cli.app.command("laps")(endurance_cli.bench_laps)
 bench_cli.app.command("faults")(endurance_cli.bench_faults)
 app.add_typer(bench_cli.app, name="bench", rich_help_panel=_MACHINE)
