@@ -29,6 +29,7 @@ _COARSEST = 4  # px: the V-cycle ends at a level that is not higher and not wide
 _TOLERANCE, _ITERATIONS = 2e-4, 60  # of conjugate gradients: change of log depth in one step, most steps
 _SWEEPS = 16  # of the path variance, most
 _LAGS, _LEAST_CHANGES = (4, 16), 30  # px of the working size; pairs of pixels
+_COPIED = 0.003  # log depth: an estimate with a smaller error at beams and floor was made from them
 _MAX_DEPTH_M = 30.0
 _FIT_POINTS = 2000  # to which scale and shift of a disparity are fitted, most
 
@@ -75,7 +76,8 @@ def complete(
 
     Returns:
         None if fewer than `MIN_PAIRS` measurements are on pixels of the estimate, or if near and far of a
-        disparity are swapped: then the estimate says nothing about this image.
+        disparity are swapped: then the estimate says nothing about this image. Also if the estimate repeats
+        the exact measurements, as that of `stixel`: then they do not tell its error elsewhere.
     """
     settings = settings or PoissonSettings()
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -91,6 +93,9 @@ def complete(
     weight = np.where(used, 1.0 / (alike * sigma**2), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         datum = np.where(used, np.log(measured_m.astype(np.float64)) - shape, 0.0)
+    exact = datum[used & (sigma < settings.exact)]
+    if len(exact) >= MIN_PAIRS and np.median(np.abs(exact - np.median(exact))) < _COPIED:
+        return None
     step = difference_sigma(np.where(used & (sigma < settings.exact), datum, np.nan), settings.step)
     right, down = _step_variance(shape, step, settings.per_jump)
     y, right, down = solve_robustly(

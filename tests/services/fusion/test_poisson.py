@@ -235,6 +235,15 @@ def test_the_error_of_differences_is_measured_in_the_image():
     assert difference_sigma(np.full((120, 160), np.nan), limits) == 0.02
 
 
+def test_an_estimate_that_was_made_from_the_measurements_is_not_used():
+    """As that of the source `stixel`: its agreement with beams and floor says nothing about other surfaces."""
+    truth = _scene()
+    measured, sigma = _measurements(truth, np.random.default_rng(11))
+    assert (
+        complete(np.where(sigma < 0.01, measured, 3.0).astype(np.float32), "metric", measured, sigma) is None
+    )
+
+
 def test_an_estimate_is_averaged_to_the_working_size():
     full = np.exp(np.random.default_rng(2).normal(size=(480, 640))).astype(np.float32)
     full[:8, :8] = np.nan
