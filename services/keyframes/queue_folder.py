@@ -61,6 +61,7 @@ class QueueFolder:
         """
         self.path = path.expanduser()
         self.corrupt = self.unreadable = 0
+        self._unremoved: set[Path] = set()  # files whose removal the disk refused
         self.fault = make_folder_if_possible(self.path)  # why keyframes cannot be written; "" = they can
         if self.fault:
             log.error("%s cannot be created (%s): keyframes are kept in memory", self.path, self.fault)
@@ -91,7 +92,11 @@ class QueueFolder:
                 yield entry
 
     def write(self, entry: QueueEntry, payload: bytes) -> None:
-        """Write a keyframe atomically. Raises OSError if the disk is full or not writable."""
+        """Write a keyframe atomically; remove the files whose removal failed before.
+
+        Raises:
+            OSError: the disk is full or not writable.
+        """
         head = msgpack.packb({
             "key": entry.key, "drive": entry.drive, "view": list(entry.view), "size": len(payload),
             "schema": entry.schema, "hash": xxhash.xxh64_digest(payload),
@@ -102,6 +107,9 @@ class QueueFolder:
             self.fault = reason(error)
             raise
         self.fault = ""
+        self._unremoved.discard(self._file(entry.key))
+        for file in list(self._unremoved):
+            self._unlink(file)
 
     def read(self, key: int) -> bytes | None:
         """Return the payload; None if the file is corrupt or cannot be read, which is logged and counted."""
@@ -121,11 +129,18 @@ class QueueFolder:
         return payload
 
     def remove(self, key: int) -> None:
-        """Remove the file of a keyframe; a file that cannot be removed is loaded again after a restart."""
+        """Remove the file of a keyframe; if the disk refuses, after the next keyframe that it accepts."""
+        self._unlink(self._file(key))
+
+    def _unlink(self, file: Path) -> None:
         try:
-            self._file(key).unlink(missing_ok=True)
+            file.unlink(missing_ok=True)
         except OSError as error:
-            log.warning("%s cannot be removed: %s", self._file(key), error.strerror)
+            if file not in self._unremoved:
+                log.warning("%s cannot be removed: %s", file, error.strerror)
+            self._unremoved.add(file)
+        else:
+            self._unremoved.discard(file)
 
     def _file(self, key: int) -> Path:
         return self.path / f"{key:020d}{_SUFFIX}"
@@ -137,10 +152,7 @@ class QueueFolder:
     def _discard(self, file: Path, error: Exception) -> None:
         self.corrupt += 1
         log.warning("%s is unusable and is removed: %s", file, error)
-        try:
-            file.unlink(missing_ok=True)
-        except OSError as other:
-            log.warning("%s cannot be removed either: %s", file, other.strerror)
+        self._unlink(file)
 
 
 def _head_of(data: bytes) -> tuple[dict, int]:

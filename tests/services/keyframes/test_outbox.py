@@ -1,7 +1,9 @@
 """What was not acknowledged: sent again in time, kept within bounds, on a disk that may fail."""
 
+import errno
 import os
 import struct
+from pathlib import Path
 
 import msgpack
 import numpy as np
@@ -213,6 +215,22 @@ def test_a_file_that_the_disk_cannot_read_stays_for_the_next_start(tmp_path):
         assert sent(box, 9 * S) == []
     assert box.corrupt == 1
     assert first.exists()
+
+
+def test_a_file_that_a_read_only_disk_kept_is_removed_once_the_disk_accepts_a_keyframe(tmp_path, monkeypatch):
+    box = Outbox(10**6, 10**10, 4, tmp_path)
+    put(box, 1)
+    put(box, 2)
+
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with monkeypatch.context() as read_only:
+        read_only.setattr(Path, "unlink", refuse)
+        assert box.acknowledge(1, 0)
+    assert len(list(tmp_path.iterdir())) == 2
+    put(box, 3)
+    assert {int(file.stem) for file in tmp_path.iterdir()} == {2, 3}
 
 
 def test_bounds_and_folders_that_make_no_sense_are_refused(tmp_path):
