@@ -92,7 +92,7 @@ _ROWS = (
     Topic("fusion/cloud",            m.Cloud,         ("fusion",),               1, "latest"),
     Topic("keyframes/frame",         m.Keyframe,      ("keyframes",),           2, "every", 60, "bulk", True),
     Topic("keyframes/ack",           m.KeyframeAck,   ("mapping",),              2, "every", 60, "down"),
-    Topic("mapping/chunk",           m.MapChunk,      ("mapping",),              2, "every", 16),
+    Topic("mapping/chunk",           m.MapChunk,      ("mapping",),              2, "every", 60),
     Topic("mapping/anchors",         m.MapAnchors,    ("mapping",),              0, "latched", 1),
     Topic("mapping/poses",           m.MapPoses,      ("mapping",),              0, "latched", 1),
     Topic("mapping/preview",         m.MapPreview,    ("mapping",),              2, "latest"),

@@ -1,7 +1,7 @@
 """What the fork server of a system holds for all processes: the last module that it imports.
 
 Its pages are shared with the processes that are forked from it, as long as neither writes to them. Numba with
-LLVM takes 60 MB and 0.6 s of CPU time in each process that imports it by itself; four of the services do.
+LLVM is large, and slow to import; several services need it.
 The garbage collector would write to every object that it visits, and so copy all pages: it leaves out what
 exists here.
 """
