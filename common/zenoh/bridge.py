@@ -126,13 +126,25 @@ class Bridge:
 
         thinning = PoseThinning() if row.thinned else None
         skipped: list[zenoh.Sample] = []  # the newest message, if it was not forwarded
+        # The end marker has another thread, which must see what was skipped; nothing is skipped after it.
+        deciding, ending = threading.Lock(), threading.Event()
+
+        def skip(sample: zenoh.Sample) -> bool:
+            """Return whether a message is left out; `send_end` forwards the last one before the end."""
+            if thinning is None:
+                return False
+            with deciding:
+                skipped.clear()
+                # What is still in transit then is needed.
+                ended = ending.is_set() or row.name in self._ends
+                if thinning.is_due(_pose_in(sample, row)) or ended:
+                    return False
+                skipped.append(sample)
+                return True
 
         def send(sample: zenoh.Sample) -> bool:
             header = decode_header(sample, row)
-            skipped.clear()
-            ended = row.name in self._ends  # what is still in transit then is needed
-            if thinning is not None and not (thinning.is_due(_pose_in(sample, row)) or ended):
-                skipped.append(sample)
+            if skip(sample):
                 return False
             _put(publisher, sample)
             ended_by, sent = self._ends.get(row.name, ("", 0))
@@ -146,11 +158,17 @@ class Bridge:
 
         def send_end(sample: zenoh.Sample) -> bool:
             header, sent = decode_end_marker(sample)
-            for last in skipped:  # subscribers wait for the last message before the end
-                _put(publisher, last)
-            skipped.clear()
-            _put(end_publisher, sample)
-            self._ends[row.name] = (header.instance, sent)
+            with deciding:
+                ending.set()
+                last = skipped[:]
+                skipped.clear()
+            try:
+                for message in last:  # subscribers wait for the last message before the end
+                    _put(publisher, message)
+                _put(end_publisher, sample)
+                self._ends[row.name] = (header.instance, sent)
+            finally:
+                ending.clear()
             return True
 
         self._forward(source, f"end/{row.name}", end, send_end, None)

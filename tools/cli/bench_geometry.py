@@ -44,9 +44,9 @@ def bench_geometry(
 
     Examples:
 
-        beamsplat bench geometry ../shared/data/house_a --seconds 25
+        beamsplat bench geometry drive --seconds 25
 
-        beamsplat bench geometry ../shared/data/house_a --without-beams fastdepth --weight 0 --weight 0.15
+        beamsplat bench geometry drive --without-beams fastdepth --weight 0 --weight 0.15
     """
     import cv2
 

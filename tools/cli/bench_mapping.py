@@ -86,9 +86,9 @@ def bench_map(
 
     Examples:
 
-        beamsplat bench map ../shared/data/house_a --json
+        beamsplat bench map drive --json
 
-        beamsplat bench map ../shared/data/house_a --prior truth --refine-s 0 --jump --settle-steps 300
+        beamsplat bench map drive --prior truth --refine-s 0 --jump --settle-steps 300
     """
     import cv2
 
